@@ -1,0 +1,284 @@
+"""One subject's way through the stages: settings, keys, what is there, and running what is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline import assets as third_party
+from pipeline import digest
+from pipeline.artifact import Artifact, Store
+from pipeline.errors import UserError
+from pipeline.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
+from pipeline.stage import Context, Stage, load_stages
+from pipeline.subjects import Subject, load_subject, require_footage
+from pipeline.workspace import Workspace, open_workspace
+
+# Words of the command line that are no stage's settings.
+PLACES = ("data", "artifacts", "assets", "body", "stages")
+WORDS = ("subject", "preset", "source", *PLACES)
+DEFAULT_PRESET = "quick"
+
+Found = dict[str, Artifact | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One subject with everything decided.
+
+    Attributes:
+        workspace: where things lie.
+        stages: every stage, upstream first.
+        subject: who, and the footage.
+        settings: stage name -> its settings object.
+        words: the command line that says all this, for starting a stage's process.
+    """
+
+    workspace: Workspace
+    stages: Mapping[str, Stage]
+    subject: Subject
+    settings: Mapping[str, Any]
+    words: tuple[str, ...]
+
+    @property
+    def store(self) -> Store:
+        return Store(self.workspace.artifacts)
+
+    @functools.cached_property
+    def source_digest(self) -> str:
+        source = require_footage(self.workspace, self.subject)
+        return digest.of_source(source, self.workspace.artifacts / ".digests.json")
+
+    @functools.cached_property
+    def body_digest(self) -> str:
+        if not self.workspace.body_file.is_file():
+            raise UserError(
+                f"{self.workspace.body_file}: there is no body model; leave out body= for the open one"
+            )
+        return digest.of_source(self.workspace.body_file, self.workspace.artifacts / ".digests.json")
+
+    def description(self, name: str, found: Found | None = None) -> dict[str, Any]:
+        """What the key of a stage's result is made from; also the head of its manifest.
+
+        Args:
+            found: what this look at the store has found so far.
+
+        Raises:
+            UserError: an upstream result is not there, or the footage is not.
+        """
+        stage = self.stages[name]
+        inputs = {}
+        for upstream, patterns in stage.needs.items():
+            artifact = self.find(upstream, found)
+            if artifact is None:
+                raise UserError(
+                    f"{name} needs {upstream} of '{self.subject.name}': doit run {upstream}:{self.subject.name}"
+                )
+            inputs[upstream] = {"files": list(patterns), "sha256": artifact.digest_of(patterns)}
+        pins = third_party.load_assets(self.workspace) if stage.assets else {}
+        return {
+            "stage": name,
+            "version": stage.version,
+            "settings": as_dict(self.settings[name]),
+            "inputs": inputs,
+            "assets": {asset: pins[asset].identity for asset in stage.assets},
+            "source": self.source_digest if stage.reads_source else None,
+            "body": self.body_digest if stage.reads_body else None,
+        }
+
+    def find(self, name: str, found: Found | None = None) -> Artifact | None:
+        """The stage's result under the present settings and inputs, if the store holds it.
+
+        Args:
+            found: what this look at the store has found so far, so that each stage is looked at once.
+
+        Raises:
+            UserError: the footage is not there.
+        """
+        found = {} if found is None else found
+        if name not in found:
+            whole = all(self.find(upstream, found) is not None for upstream in self.stages[name].needs)
+            found[name] = (
+                self.store.find(self.subject.name, name, key_of(self.description(name, found)))
+                if whole
+                else None
+            )
+        return found[name]
+
+    def is_current(self, name: str) -> bool:
+        """Whether nothing needs to run; if so, ``latest`` is pointed at the result."""
+        artifact = self.find(name)
+        if artifact is not None:
+            self.store.select(artifact)
+        return artifact is not None
+
+
+def key_of(description: Mapping[str, Any]) -> str:
+    """The key of a version: a digest of what it is made from."""
+    return digest.of_json(description)[:16]
+
+
+def words_to_dict(words: Iterable[str]) -> dict[str, str]:
+    """``["train.seed=3"]`` as ``{"train.seed": "3"}``.
+
+    Raises:
+        UserError: a word has no '='.
+    """
+    pairs = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise UserError(f"'{word}' is not of the form NAME=VALUE")
+        pairs[name] = value
+    return pairs
+
+
+def check_words(words: Mapping[str, str], stages: Mapping[str, Stage]) -> None:
+    """Refuses a word that is neither a setting nor one of ``WORDS``, showing the near names."""
+    settings = [
+        f"{name}.{field.name}"
+        for name, stage in stages.items()
+        for field in dataclasses.fields(stage.settings)
+    ]
+    for word in words:
+        if "." not in word and word not in WORDS:
+            raise UserError(f"the command line: there is no '{word}'{near(word, [*WORDS, *settings])}")
+
+
+def preset_layer(workspace: Workspace, name: str) -> Layer:
+    """The settings of a preset.
+
+    Raises:
+        UserError: there is no such preset; shows which there are.
+    """
+    path = workspace.data / "presets" / f"{name}.toml"
+    if not path.is_file():
+        known = sorted(file.stem for file in (workspace.data / "presets").glob("*.toml"))
+        raise UserError(
+            f"preset={name}: there is no such preset; there are {', '.join(known)}{near(name, known)}"
+        )
+    tables = {key: value for key, value in read_toml(path).items() if key != "title"}
+    return Layer(str(path), tables)
+
+
+def setting_layers(workspace: Workspace, words: Mapping[str, str], subject: Subject | None) -> list[Layer]:
+    """The layers of settings, the weakest first."""
+    overrides = {name: value for name, value in words.items() if "." in name}
+    layers = [preset_layer(workspace, words.get("preset", DEFAULT_PRESET))]
+    return [*layers, *(subject.layers if subject else ()), command_line_layer(overrides)]
+
+
+def workspace_from_words(words: Mapping[str, str]) -> Workspace:
+    """The workspace that the command line names, or this checkout's."""
+    return open_workspace(**{place: words[place] for place in PLACES if place in words})
+
+
+def check_command_line(words: Mapping[str, str]) -> None:
+    """Refuses wrong names and values on the command line before anything runs.
+
+    Raises:
+        UserError: says which, and shows the near names.
+    """
+    workspace = workspace_from_words(words)
+    stages = load_stages(workspace.stages)
+    check_words(words, stages)
+    resolve({name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, None))
+
+
+def job_from_words(subject: str, words: Mapping[str, str]) -> Job:
+    """The job of one subject under a command line's words.
+
+    Raises:
+        UserError: a name, a value or a file is wrong.
+    """
+    workspace = workspace_from_words(words)
+    stages = load_stages(workspace.stages)
+    check_words(words, stages)
+    who = load_subject(workspace, subject, words.get("source"))
+    settings = resolve(
+        {name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, who)
+    )
+    passed = tuple(f"{name}={value}" for name, value in words.items() if name != "subject")
+    return Job(workspace, stages, who, settings, passed)
+
+
+def run_stage(job: Job, name: str) -> Artifact:
+    """Makes a stage's result unless the store holds it, and publishes it.
+
+    Raises:
+        UserError: an input is not there, or the stage's own reasons.
+    """
+    description = job.description(name)
+    key = key_of(description)
+    subject = job.subject.name
+
+    def say_waiting() -> None:
+        print(f"{name}:{subject} another process is making the same result; waiting for it", flush=True)
+
+    with job.store.scratch(subject, name, key, say_waiting) as scratch:
+        already = job.store.find(subject, name, key)
+        if already is not None:
+            job.store.select(already)
+            return already
+        stage = job.stages[name]
+        upstream = {other: job.find(other) for other in stage.needs}
+        context = Context(
+            subject=subject,
+            settings=job.settings[name],
+            inputs={other: artifact.folder for other, artifact in upstream.items() if artifact is not None},
+            assets={asset: third_party.require(job.workspace, asset) for asset in stage.assets},
+            source=require_footage(job.workspace, job.subject) if stage.reads_source else None,
+            body=job.workspace.body,
+            body_file=job.workspace.body_file,
+            output=scratch.output,
+            work=scratch.work,
+            stage=name,
+        )
+        start = time.monotonic()
+        entry_point(stage)(context)
+        seconds = time.monotonic() - start
+        artifact = job.store.publish(scratch, subject, name, key, description, run_record(context, seconds))
+        context.log(f"done in {seconds:.1f} s: {shown(artifact.folder)}")
+        return artifact
+
+
+def entry_point(stage: Stage) -> Any:
+    """The stage's ``run`` function, imported now."""
+    module, _, function = stage.run.partition(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def run_record(context: Context, seconds: float) -> dict[str, Any]:
+    """What differs between two equal runs: time, memory, machine."""
+    try:
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1 if sys.platform != "darwin" else 1024)
+    except ImportError:  # Windows
+        peak = 0
+    return {
+        "seconds": round(seconds, 3),
+        "peak_memory_mib": round(peak / 1024, 1),
+        "host": platform.node(),
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "timings": context.timings,
+    }
+
+
+def shown(path: Path) -> str:
+    """A path as a user would type it: relative to the present folder where that is shorter."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

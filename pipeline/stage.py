@@ -1,0 +1,228 @@
+"""What a stage is, and running one: ``python -m pipeline.stage fit --subject oliver train.seed=3``.
+
+A stage is declared in ``stages/<name>/__init__.py`` as ``STAGE`` and found there by its name, so that
+this package needs no import of any stage. Each run is a process of its own: a crash or an
+out-of-memory kill ends one stage, memory goes back, and the same line works under any scheduler.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import errno
+import importlib
+import os
+import pkgutil
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.settings import near
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """The declaration of a stage.
+
+    Attributes:
+        name: the folder under ``stages`` and the name in the store.
+        version: raised by hand when the same inputs would give another result.
+        settings: a frozen dataclass; its defaults are the ``quick`` preset's.
+        run: ``"module:function"``, imported only in the stage's own process.
+        needs: upstream stage -> patterns of its files that this stage reads. Only those files'
+            digests enter the key, so a change to any other does not make this stage stale.
+        assets: the names in data/assets.toml that must be on disk.
+        reads_source: whether it reads the footage.
+        reads_body: whether it reads the body model.
+    """
+
+    name: str
+    version: int
+    settings: type
+    run: str
+    needs: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    assets: tuple[str, ...] = ()
+    reads_source: bool = False
+    reads_body: bool = False
+
+
+def load_stages(package: str = "stages") -> dict[str, Stage]:
+    """Every stage declared in the sub-packages of ``package``, upstream before downstream.
+
+    Raises:
+        UserError: a stage needs one that does not exist, or two need each other.
+    """
+    folder = importlib.import_module(package)
+    names = sorted(module.name for module in pkgutil.iter_modules(folder.__path__) if module.ispkg)
+    found: dict[str, Stage] = {}
+    for name in names:
+        stage = importlib.import_module(f"{package}.{name}").STAGE
+        found[stage.name] = stage
+    ordered: dict[str, Stage] = {}
+    while len(ordered) < len(found):
+        ready = [
+            stage for name, stage in found.items() if name not in ordered and set(stage.needs) <= set(ordered)
+        ]
+        if not ready:
+            raise UserError(
+                f"{package}: stages that need each other or what does not exist: {sorted(set(found) - set(ordered))}"
+            )
+        ordered.update((stage.name, stage) for stage in ready)
+    return ordered
+
+
+class Progress:
+    """A bar with ETA on a terminal; elsewhere a line at most every ten seconds."""
+
+    QUIET_SECONDS = 10.0
+
+    def __init__(self, total: int, label: str) -> None:
+        from tqdm import tqdm
+
+        self.total, self.label, self.done = total, label, 0
+        self.start = self.last = time.monotonic()
+        self.bar = tqdm(total=total, desc=label, unit="", dynamic_ncols=True) if sys.stderr.isatty() else None
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        """Counts ``steps`` more as done; ``note`` is shown beside the bar."""
+        self.done += steps
+        if self.bar is not None:
+            if note:
+                self.bar.set_postfix_str(note, refresh=False)
+            self.bar.update(steps)
+            return
+        now = time.monotonic()
+        if now - self.last >= self.QUIET_SECONDS:
+            self.last = now
+            left = (now - self.start) / max(self.done, 1) * (self.total - self.done)
+            print(f"{self.label}: {self.done}/{self.total}, {left:.0f} s left {note}".rstrip(), flush=True)
+
+    def close(self) -> None:
+        """Takes the bar away."""
+        if self.bar is not None:
+            self.bar.close()
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What a stage's ``run`` is given.
+
+    Attributes:
+        subject: the subject's name.
+        settings: this stage's settings object.
+        inputs: upstream stage -> folder of its published files; read only.
+        assets: asset name -> its folder.
+        source: the footage, for a stage that reads it.
+        body: the folder of the open body and the landmarks.
+        body_file: the body model in use.
+        output: what is written here is published.
+        work: for checkpoints: it survives a killed run and is never published.
+        timings: filled by ``timing``; goes to run.json.
+    """
+
+    subject: str
+    settings: Any
+    inputs: Mapping[str, Path]
+    assets: Mapping[str, Path]
+    source: Path | None
+    body: Path
+    body_file: Path
+    output: Path
+    work: Path
+    stage: str = ""
+    timings: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def progress(self, total: int, label: str) -> Iterator[Progress]:
+        """A progress display for ``total`` steps."""
+        progress = Progress(total, f"{self.stage}:{self.subject} {label}")
+        try:
+            yield progress
+        finally:
+            progress.close()
+
+    def log(self, message: str) -> None:
+        """One line to the terminal."""
+        print(f"{self.stage}:{self.subject} {message}", flush=True)
+
+    def timing(self, name: str, value: Any) -> None:
+        """Notes something that differs between two equal runs (seconds, memory), for run.json."""
+        self.timings[name] = value
+
+
+def explain(error: Exception, where: Path) -> str | None:
+    """The one line that a user is shown for this error, or None if it is a defect of ours."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return (
+            f"{error.filename or where}: the disk is full; free some space or choose another store "
+            "(artifacts=FOLDER), then run the same command again"
+        )
+    if isinstance(error, PermissionError):
+        return f"{error.filename or where}: no permission to write; choose another store: artifacts=FOLDER"
+    return None
+
+
+def parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    """The command line of one stage."""
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline.stage", description="Run one stage for one subject."
+    )
+    parser.add_argument("stage")
+    parser.add_argument("--subject", required=True)
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="NAME=VALUE",
+        help="as after 'doit run': preset=, source=, train.seed= ...",
+    )
+    return parser.parse_intermixed_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one stage; returns the exit status."""
+    from pipeline.job import job_from_words, run_stage, words_to_dict
+
+    options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+    where = Path.cwd()
+    try:
+        job = job_from_words(options.subject, words_to_dict(options.words))
+        if options.stage not in job.stages:
+            raise UserError(f"there is no stage '{options.stage}'{near(options.stage, job.stages)}")
+        where = job.workspace.artifacts
+        run_stage(job, options.stage)
+    except KeyboardInterrupt:
+        print(
+            f"{options.stage}:{options.subject} stopped; the same command goes on from here", file=sys.stderr
+        )
+        return 130
+    except Exception as error:
+        message = explain(error, where)
+        if message is None:
+            raise
+        print(f"{options.stage}:{options.subject} failed: {message}", file=sys.stderr, flush=True)
+        return 1
+    return 0
+
+
+def process_environment() -> dict[str, str]:
+    """The environment of a stage's process.
+
+    The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
+    zeroed pages at every step; they must be set before Python starts.
+    """
+    defaults = {
+        "MALLOC_MMAP_THRESHOLD_": "4294967296",
+        "MALLOC_TRIM_THRESHOLD_": "4294967296",
+        "MALLOC_TOP_PAD_": "268435456",
+    }
+    return {**defaults, **os.environ}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""The rules that keep the house in order, checked on the code itself."""
+
+import ast
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.stage import load_stages
+from pipeline.workspace import REPOSITORY
+
+
+def imports(path):
+    """Every module name that a file imports, wherever it does so."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide what belongs to whom"
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def sources(folder):
+    return sorted((REPOSITORY / folder).rglob("*.py"))
+
+
+def test_pipeline_never_imports_stages():
+    for path in sources("pipeline"):
+        assert not [name for name in imports(path) if name.split(".")[0] == "stages"], path
+
+
+def test_no_stage_imports_another():
+    for path in sources("stages"):
+        own = path.relative_to(REPOSITORY / "stages").parts[0]
+        others = [name for name in imports(path) if name.startswith("stages.") and name.split(".")[1] != own]
+        assert not others, f"{path} imports {others}"
+
+
+def test_a_stage_is_declared_by_the_name_of_its_folder():
+    for name, stage in load_stages().items():
+        assert stage.name == name and (REPOSITORY / "stages" / name / "run.py").is_file()
+
+
+def test_the_dag_loads_nothing_heavy():
+    code = "import sys, dodo; print([name for name in ('torch', 'numpy', 'cv2', 'numba', 'pyarrow') if name in sys.modules])"
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("folder", ["pipeline", "stages", "benchmarks", "tools", "tests"])
+def test_files_stay_short(folder):
+    long = {
+        str(path): lines
+        for path in sources(folder)
+        if (lines := path.read_text(encoding="utf-8").count("\n")) > 420
+    }
+    assert not long

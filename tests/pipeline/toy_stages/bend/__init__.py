@@ -1,0 +1,12 @@
+import dataclasses
+
+from pipeline.stage import Stage
+
+
+@dataclasses.dataclass(frozen=True)
+class BendSettings:
+    angle: float = 1.0
+    fail: str = ""  # "user", "bug", "disk", "sleep"
+
+
+STAGE = Stage("bend", 1, BendSettings, "tests.pipeline.toy_stages.work:bend", needs={"gather": ("text.txt",)})

@@ -1,0 +1,51 @@
+"""What the toy stages do. Each run leaves a line in ``ran.log`` beside the store, to be counted."""
+
+import errno
+import os
+import time
+
+from pipeline.errors import UserError
+
+
+def note(context):
+    with (context.output.parents[4] / "ran.log").open("a") as file:
+        file.write(f"{context.stage}:{context.subject}\n")
+
+
+def gather(context):
+    note(context)
+    text = context.source.read_text()
+    (context.output / "text.txt").write_text(text.upper() if context.settings.upper else text)
+    (context.output / "extra.txt").write_text(str(context.settings.unused))
+
+
+def bend(context):
+    note(context)
+    (context.output / "half.txt").write_text("half")
+    fail = context.settings.fail
+    if fail == "user":
+        raise UserError("clip.mp4: is not a clip; name another")
+    if fail == "bug":
+        raise ZeroDivisionError("ours")
+    if fail == "disk":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(context.output / "half.txt"))
+    text = (context.inputs["gather"] / "text.txt").read_text()
+    (context.output / "bent.txt").write_text(f"{text}{context.settings.angle}")
+
+
+def paint(context):
+    """Counts up to ``iterations``, one checkpoint each, and says where it began."""
+    note(context)
+    checkpoint = context.work / "count.txt"
+    done = int(checkpoint.read_text()) if checkpoint.exists() else 0
+    with (context.output.parents[4] / "began.log").open("a") as file:
+        file.write(f"{done}\n")
+    with context.progress(context.settings.iterations, "painting") as progress:
+        while done < context.settings.iterations:
+            done += 1
+            checkpoint.write_text(str(done))
+            progress.advance()
+            if context.settings.rate:
+                time.sleep(context.settings.rate)
+    context.timing("steps", done)
+    (context.output / "painted.txt").write_text((context.inputs["bend"] / "bent.txt").read_text() * done)
