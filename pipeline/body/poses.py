@@ -1,0 +1,92 @@
+"""A clip's motion: a pose, an expression and a place for every frame, and their Parquet file."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from pipeline.body.joints import JOINT_NAMES
+from pipeline.errors import UserError
+
+_JOINTS = len(JOINT_NAMES)
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """The motion of one body over a clip.
+
+    Attributes:
+        frames: the T frame numbers in the source clip, ascending.
+        rotation: theta, [T, 55, 3], rotation vectors in radians relative to the parent joint, in
+            the order of ``JOINT_NAMES``; joint 0 is global_orient.
+        expression: psi, [T, E].
+        transl: [T, 3], metres, added to the posed body.
+    """
+
+    frames: tuple[int, ...]
+    rotation: Tensor  # [T, 55, 3]
+    expression: Tensor  # [T, E]
+    transl: Tensor  # [T, 3]
+
+    def __post_init__(self) -> None:
+        """Refuse arrays whose lengths disagree."""
+        count = len(self.frames)
+        if tuple(self.rotation.shape) != (count, _JOINTS, 3):
+            raise ValueError(f"rotation has shape {tuple(self.rotation.shape)}, not ({count}, {_JOINTS}, 3)")
+        if self.expression.shape[:-1] != (count,) or self.transl.shape != (count, 3):
+            raise ValueError("expression and transl must have a row for every frame")
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def index(self, frame: int) -> int:
+        """The row of a frame number.
+
+        Raises:
+            ValueError: the clip has no such frame.
+        """
+        return self.frames.index(frame)
+
+
+def write_poses(path: Path, poses: Poses) -> None:
+    """Write ``poses.parquet``: ``frame`` int32, ``rotation`` [165], ``expression`` [E], ``transl`` [3]."""
+    columns = {
+        "frame": pa.array(poses.frames, pa.int32()),
+        "rotation": _column(poses.rotation.flatten(1)),
+        "expression": _column(poses.expression),
+        "transl": _column(poses.transl),
+    }
+    pq.write_table(pa.table(columns), path, compression="zstd")
+
+
+def read_poses(path: Path) -> Poses:
+    """Read what ``write_poses`` wrote; tensors are float32.
+
+    Raises:
+        UserError: the file is damaged or lacks a column.
+    """
+    try:
+        table = pq.read_table(path, columns=["frame", "rotation", "expression", "transl"])
+        frames = tuple(table["frame"].to_pylist())
+        rotation, expression, transl = (_rows(table, name) for name in ("rotation", "expression", "transl"))
+        return Poses(frames, rotation.unflatten(1, (_JOINTS, 3)), expression, transl)
+    except (OSError, KeyError, ValueError, RuntimeError, pa.ArrowInvalid) as error:
+        raise UserError(f"{path} cannot be read as poses ({error}): run the fit stage again") from error
+
+
+def _column(values: Tensor) -> pa.FixedSizeListArray:
+    """[T, K] -> a Parquet column of fixed-size lists of K float32."""
+    array = values.detach().cpu().numpy().astype(np.float32)
+    return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
+
+
+def _rows(table: pa.Table, name: str) -> Tensor:
+    column = table[name].combine_chunks()
+    flat = column.values.to_numpy(zero_copy_only=False).astype(np.float32)
+    return torch.from_numpy(flat.reshape(len(column), column.type.list_size).copy())

@@ -1,0 +1,1 @@
+"""The steps that find estimators' keypoints on a body."""
