@@ -1,0 +1,106 @@
+"""Pictures on disk: numbered frames and masks as 8-bit PNG, and video that a browser plays.
+
+``<folder>/<number:06d>.png`` where the number is the frame's place in the source clip. Frames are RGB
+in the clip's own (gamma-encoded) colours; masks are grey, 255 where the pixel is wholly the person's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.errors import UserError
+
+
+def frame_path(folder: Path, index: int) -> Path:
+    """Where frame or mask number ``index`` lies."""
+    return folder / f"{index:06d}.png"
+
+
+def read_frame(folder: Path, index: int) -> np.ndarray:
+    """Frame number ``index``: [H, W, 3] uint8 RGB.
+
+    Raises:
+        UserError: the picture is missing or damaged.
+    """
+    return np.ascontiguousarray(_read(frame_path(folder, index), cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def read_mask(folder: Path, index: int) -> np.ndarray:
+    """The person's alpha in frame number ``index``: [H, W] uint8.
+
+    Raises:
+        UserError: the picture is missing or damaged.
+    """
+    return _read(frame_path(folder, index), cv2.IMREAD_GRAYSCALE)
+
+
+def write_frame(folder: Path, index: int, image: np.ndarray) -> None:
+    """Write a frame, [H, W, 3] uint8 RGB."""
+    _check(image, 3)
+    write_png(frame_path(folder, index), image)
+
+
+def write_mask(folder: Path, index: int, mask: np.ndarray) -> None:
+    """Write a mask, [H, W] uint8."""
+    _check(mask, 2)
+    write_png(frame_path(folder, index), mask)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write [H, W, 3] RGB or [H, W] grey, uint8; OSError where the disk refuses."""
+    stored = image[..., ::-1] if image.ndim == 3 else image
+    # cv2.imwrite swallows a full disk, so the bytes are written here.
+    encoded = cv2.imencode(".png", np.ascontiguousarray(stored), [cv2.IMWRITE_PNG_COMPRESSION, 4])[1]
+    path.write_bytes(encoded.tobytes())
+
+
+def write_video(path: Path, images: Iterable[np.ndarray], fps: float) -> None:
+    """Write H.264 in MP4, yuv420p, which every browser plays. Equal input gives equal bytes.
+
+    Args:
+        path: the .mp4 file.
+        images: [H, W, 3] uint8 RGB, all of one size; an odd side is padded by one pixel.
+        fps: frames a second.
+
+    Raises:
+        ValueError: there are no images, or their sizes differ.
+    """
+    import av  # loads FFmpeg, which readers of stills do without
+
+    rate = Fraction(fps).limit_denominator(1001)
+    size: tuple[int, ...] = ()
+    with av.open(str(path), "w", options={"movflags": "+faststart", "fflags": "+bitexact"}) as container:
+        # A fixed thread count: x264 cuts the work, and with it the bytes, by the number of threads.
+        encoding = {"crf": "18", "preset": "fast", "threads": "2"}
+        stream = container.add_stream("libx264", rate, options=encoding)
+        for image in images:
+            if not size:
+                size = image.shape
+                stream.height, stream.width = size[0] + size[0] % 2, size[1] + size[1] % 2
+                stream.pix_fmt = "yuv420p"
+            if image.shape != size:
+                raise ValueError(f"frames of {size} and {image.shape} cannot share a video")
+            even = np.pad(image, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+        if not size:
+            raise ValueError(f"{path.name}: no frames to write")
+        container.mux(stream.encode())
+
+
+def _read(path: Path, flags: int) -> np.ndarray:
+    if not path.is_file():
+        raise UserError(f"{path} is missing: run the ingest stage again")
+    image = cv2.imdecode(np.fromfile(path, np.uint8), flags) if path.stat().st_size else None
+    if image is None:
+        raise UserError(f"{path} is not a readable picture: run the ingest stage again")
+    return image
+
+
+def _check(image: np.ndarray, dimensions: int) -> None:
+    if image.dtype != np.uint8 or image.ndim != dimensions:
+        raise ValueError(f"expected uint8 with {dimensions} dimensions, not {image.dtype} {image.shape}")

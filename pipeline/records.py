@@ -1,0 +1,182 @@
+"""The small records that travel between the stages: cameras, the split, what the footage was.
+
+``cameras.parquet`` has one row a kept frame: ``frame``, ``width``, ``height`` (int32, pixels),
+``intrinsics`` [9] and ``rotation`` [9] (float64, row by row) and ``translation`` [3] (float64, metres),
+world-to-camera with OpenCV axes as in :mod:`pipeline.camera`.
+``split.json`` is ``{"train": [...], "test": [...]}``, frame numbers.
+``footage.json`` holds the fields of :class:`Footage`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.tables import read_table, vectors, write_table
+
+CAMERA_SCHEMA = pa.schema(
+    [
+        ("frame", pa.int32()),
+        ("width", pa.int32()),
+        ("height", pa.int32()),
+        ("intrinsics", vectors(9, pa.float64())),
+        ("rotation", vectors(9, pa.float64())),
+        ("translation", vectors(3, pa.float64())),
+    ]
+)
+_REMEDY = "run the ingest stage again"
+
+
+def write_cameras(path: Path, cameras: Mapping[int, Camera]) -> None:
+    """Write ``cameras.parquet``, sorted by frame number."""
+    frames = sorted(cameras)
+
+    def column(name: str, size: int) -> np.ndarray:
+        rows = [getattr(cameras[frame], name).detach().double().numpy().reshape(size) for frame in frames]
+        return np.array(rows, np.float64).reshape(len(frames), size)
+
+    columns = {
+        "frame": np.array(frames, np.int32),
+        "width": np.array([cameras[frame].width for frame in frames], np.int32),
+        "height": np.array([cameras[frame].height for frame in frames], np.int32),
+        "intrinsics": column("intrinsics", 9),
+        "rotation": column("rotation", 9),
+        "translation": column("translation", 3),
+    }
+    write_table(path, CAMERA_SCHEMA, columns)
+
+
+def read_cameras(path: Path, dtype: torch.dtype = torch.float32) -> dict[int, Camera]:
+    """Read ``cameras.parquet``: frame number -> camera.
+
+    Raises:
+        UserError: the file is missing or malformed, an image is empty, a focal length is not
+            positive, or a rotation is not one.
+    """
+    columns = read_table(path, CAMERA_SCHEMA, _REMEDY)
+    cameras = {}
+    for row, frame in enumerate(columns["frame"].tolist()):
+        width, height = int(columns["width"][row]), int(columns["height"][row])
+        intrinsics = columns["intrinsics"][row].reshape(3, 3)
+        rotation = columns["rotation"][row].reshape(3, 3)
+        if min(width, height) < 1 or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+            raise UserError(f"{path}: the camera of frame {frame} is empty: {_REMEDY}")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise UserError(f"{path}: the camera of frame {frame} has no proper rotation: {_REMEDY}")
+        arrays = (intrinsics, rotation, columns["translation"][row])
+        cameras[frame] = Camera(width, height, *(torch.tensor(array, dtype=dtype) for array in arrays))
+    return cameras
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Which frames are learnt from and which are held out; frame numbers, increasing, disjoint."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+
+
+def write_split(path: Path, split: Split) -> None:
+    """Write ``split.json``."""
+    write_json(path, {"train": list(split.train), "test": list(split.test)})
+
+
+def read_split(path: Path) -> Split:
+    """Read ``split.json``.
+
+    Raises:
+        UserError: missing or malformed, no training frame, or a frame in both parts.
+    """
+    value = read_json(path, _REMEDY)
+    parts = {}
+    for name in ("train", "test"):
+        frames = value.get(name) if isinstance(value, dict) else None
+        if not isinstance(frames, list) or not all(type(frame) is int and frame >= 0 for frame in frames):
+            raise UserError(f"{path}: {name!r} must be a list of frame numbers: {_REMEDY}")
+        parts[name] = tuple(sorted(frames))
+    frames = parts["train"] + parts["test"]
+    if not parts["train"] or len(set(frames)) < len(frames):
+        raise UserError(f"{path}: train is empty, or a frame stands twice: {_REMEDY}")
+    return Split(**parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Footage:
+    """What the source was and what was kept of it.
+
+    Attributes:
+        name: the source's file or folder name.
+        width, height: the source's upright size in pixels.
+        fps: frames a second of the source on average; 0 where the source has no clock (images).
+        scale: stored frame size over source size.
+        read: how many frames were looked at.
+        kept: how many were published.
+        dropped: reason -> how many frames were left out for it.
+        people: how many people were noticed in the clip; 0 where nobody counted.
+        seconds: the time of each kept frame from the clip's start, in the order of the frames.
+        sources: what the keypoints and the masks came from.
+    """
+
+    name: str
+    width: int
+    height: int
+    fps: float
+    scale: float
+    read: int
+    kept: int
+    dropped: Mapping[str, int]
+    people: int
+    seconds: tuple[float, ...]
+    sources: Mapping[str, str]
+
+
+def write_footage(path: Path, footage: Footage) -> None:
+    """Write ``footage.json``."""
+    write_json(path, dataclasses.asdict(footage))
+
+
+def read_footage(path: Path) -> Footage:
+    """Read ``footage.json``; UserError where it is missing or malformed."""
+    value = read_json(path, _REMEDY)
+    names = {field.name for field in dataclasses.fields(Footage)}
+    if not isinstance(value, dict) or set(value) != names:
+        raise UserError(f"{path}: its fields are not {', '.join(sorted(names))}: {_REMEDY}")
+    return Footage(**{**value, "seconds": tuple(value["seconds"])})
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with sorted keys; ValueError for numbers that are not finite."""
+    path.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path, remedy: str) -> Any:
+    """Read JSON.
+
+    Raises:
+        UserError: the file is missing, is not JSON, or holds NaN or an infinity.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite)
+    except FileNotFoundError:
+        raise UserError(f"{path} is missing: {remedy}") from None
+    except (ValueError, OSError, RecursionError) as error:
+        raise UserError(f"{path} is not readable JSON ({error}): {remedy}") from None
+
+
+def _refuse(name: str) -> float:
+    raise ValueError(f"it holds {name}, which is no finite number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _refuse(text)

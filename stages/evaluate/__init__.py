@@ -1,0 +1,24 @@
+"""evaluate: numbers, pictures and the report of a finished avatar."""
+
+from pipeline.stage import Stage
+from stages.evaluate.settings import EvaluateSettings
+
+STAGE = Stage(
+    name="evaluate",
+    version=1,
+    settings=EvaluateSettings,
+    run="stages.evaluate.run:run",
+    needs={
+        "ingest": (
+            "frames/*",
+            "masks/*",
+            "cameras.parquet",
+            "split.json",
+            "footage.json",
+        ),
+        "fit": ("poses.parquet", "overlay.mp4", "overlay.png"),
+        "train": ("avatar.safetensors", "curve.parquet", "visibility.parquet", "poses.parquet"),
+    },
+    assets=("lpips",),
+    reads_body=True,
+)

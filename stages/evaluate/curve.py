@@ -1,0 +1,96 @@
+"""The training curve as a drawing that suits light and dark pages."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from pipeline.tables import read_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SCHEMA = pa.schema([("iteration", pa.int32()), ("name", pa.string()), ("value", pa.float32())])
+"""Train's curve.parquet; names are ``psnr``, ``gaussians``, ``learning_rate`` and the loss terms."""
+
+Line = list[tuple[int, float]]
+"""(iteration, value), in the order of the iterations."""
+
+_PSNR = "psnr"
+_NO_LOSS = (_PSNR, "gaussians", "learning_rate")
+_IMAGE_TERMS = {"l1": "L1", "ssim": "SSIM"}
+_INK = "#808080"  # legible on white and on near-black
+_COLORS = ("#3b82c4", "#d07f2c", "#5a9e6f")
+
+
+def read_curve(path: Path) -> dict[str, Line]:
+    """Name -> line of train's ``curve.parquet``.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    columns = read_table(path, SCHEMA, "run the train stage again")
+    lines: dict[str, Line] = {}
+    rows = zip(*(columns[name].tolist() for name in SCHEMA.names), strict=True)
+    for iteration, name, value in rows:
+        lines.setdefault(name, []).append((iteration, value))
+    return lines
+
+
+def draw_curve(lines: Mapping[str, Line]) -> list[str]:
+    """Held-out PSNR and the loss terms against iterations, an SVG element each; none without lines.
+
+    The same lines give the same text. Every loss term but L1 and SSIM is part of the regularisers.
+    """
+    losses = _loss_lines(lines)
+    held_out = {"held out": lines[_PSNR]} if lines.get(_PSNR) else {}
+    return [_draw(title, group) for title, group in (("PSNR, dB", held_out), ("loss", losses)) if group]
+
+
+def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
+    """L1, SSIM, and everything else of the objective added up."""
+    found = {label: lines[name] for name, label in _IMAGE_TERMS.items() if lines.get(name)}
+    rest: dict[int, float] = {}
+    for name, line in lines.items():
+        if name not in _IMAGE_TERMS and name not in _NO_LOSS:
+            for iteration, value in line:
+                rest[iteration] = rest.get(iteration, 0.0) + value
+    return {**found, "regularisers": sorted(rest.items())} if rest else found
+
+
+def _draw(title: str, group: Mapping[str, Line]) -> str:
+    # Slow to import, and only this function draws.
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    # Without a salt every drawing has ids of its own, and equal runs would differ.
+    with matplotlib.rc_context({"svg.hashsalt": f"flexiavatar {title}", "font.size": 9}):
+        figure = Figure(figsize=(4.6, 2.9), layout="constrained")
+        _fill(figure.add_subplot(), title, group)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    return svg[svg.index("<svg") :]
+
+
+def _fill(axes: Axes, title: str, group: Mapping[str, Line]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    for color, (label, line) in zip(_COLORS, group.items(), strict=False):
+        iterations, values = zip(*line, strict=True)
+        axes.plot(iterations, values, color=color, linewidth=1.8, marker="o", markersize=3, label=label)
+    if title == "loss" and all(value > 0 for line in group.values() for _, value in line):
+        axes.set_yscale("log")
+    axes.set_title(title, loc="left", color=_INK, fontsize=10)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    axes.set_xlabel("iteration", color=_INK)
+    axes.tick_params(which="both", colors=_INK)
+    axes.grid(color=_INK, alpha=0.25, linewidth=0.6)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(_INK)
+    axes.legend(frameon=False, labelcolor=_INK)

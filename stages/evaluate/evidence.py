@@ -1,0 +1,116 @@
+"""What the avatar is judged against: the clip as ingest published it, and the poses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from torch import Tensor
+
+from pipeline.body.poses import Poses, read_poses
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.frames import read_frame, read_mask
+from pipeline.metrics.protocol import composite
+from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
+
+Item = TypeVar("Item")
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """A clip with its split, cameras and poses.
+
+    Attributes:
+        folder: what ingest published.
+        footage: what the source was and what was kept of it.
+        split: the frames that were trained on and those held out.
+        cameras: a camera a frame.
+        fitted: the fit's poses, of every kept frame.
+        refined: the training frames' poses as training left them.
+    """
+
+    folder: Path
+    footage: Footage
+    split: Split
+    cameras: Mapping[int, Camera]
+    fitted: Poses
+    refined: Poses
+
+    def frame(self, index: int) -> np.ndarray:
+        """The frame as filmed, [H, W, 3] uint8 RGB."""
+        return read_frame(self.folder / "frames", index)
+
+    def mask(self, index: int) -> np.ndarray:
+        """The person's soft alpha, [H, W] uint8."""
+        return read_mask(self.folder / "masks", index)
+
+    def person(self, index: int) -> Tensor:
+        """The person on black, [H, W, 3] float32 in [0, 1]."""
+        return composite(self.frame(index), self.mask(index))
+
+    def seconds(self, index: int) -> float | None:
+        """When the frame was filmed, from the clip's start; None where the source has no clock."""
+        row = _rows(tuple(sorted(self.cameras))).get(index)
+        known = row is not None and row < len(self.footage.seconds)
+        return self.footage.seconds[row] if known and row is not None else None
+
+    def pose(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The pose that a frame is rendered in: rotation [55, 3], expression [E], transl [3].
+
+        A training frame has the pose that training refined. A held-out frame has the fit's, which
+        knows its keypoints and nothing else of the image. (Refining it on the held-out image itself,
+        test-time pose refinement, would replace the fit's pose here, and its numbers would stand
+        beside these.)
+
+        Raises:
+            UserError: neither the fit nor training has a pose for the frame.
+        """
+        held_out = index in self.split.test
+        for poses in (self.fitted,) if held_out else (self.refined, self.fitted):
+            row = _row_of(poses, index)
+            if row is not None:
+                return poses.rotation[row], poses.expression[row], poses.transl[row]
+        raise UserError(f"frame {index} has no pose in the fit's poses.parquet: run the fit stage again")
+
+
+def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
+    """Reads what the upstream stages published.
+
+    Args:
+        inputs: the folders of ingest, fit and train.
+
+    Raises:
+        UserError: a file is missing or damaged.
+    """
+    ingest = inputs["ingest"]
+    return Evidence(
+        folder=ingest,
+        footage=read_footage(ingest / "footage.json"),
+        split=read_split(ingest / "split.json"),
+        cameras=read_cameras(ingest / "cameras.parquet"),
+        fitted=read_poses(inputs["fit"] / "poses.parquet"),
+        refined=read_poses(inputs["train"] / "poses.parquet"),
+    )
+
+
+def evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """At most ``count`` of the items, evenly spaced, first and last included."""
+    if count >= len(items):
+        return list(items)
+    if count == 1:
+        return [items[len(items) // 2]]
+    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
+
+
+@lru_cache(maxsize=4)
+def _rows(frames: tuple[int, ...]) -> Mapping[int, int]:
+    return {frame: row for row, frame in enumerate(frames)}
+
+
+def _row_of(poses: Poses, index: int) -> int | None:
+    return _rows(poses.frames).get(index)

@@ -1,0 +1,92 @@
+"""What was left out, and why: nothing is skipped silently."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+from pipeline.metrics.lpips import NETWORKS
+from stages.evaluate.evidence import Evidence
+from stages.evaluate.records import Gate
+from stages.evaluate.scoring import HELD_OUT, TRAINING, Score
+from stages.evaluate.settings import EvaluateSettings
+
+_LPIPS_COST = {"vgg": "; on a CPU it takes twenty times as long as alex"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Omission:
+    """Something that was not done.
+
+    Attributes:
+        what: in a few words.
+        why: the reason, with the number that decided it.
+    """
+
+    what: str
+    why: str
+
+
+def omissions(
+    evidence: Evidence, settings: EvaluateSettings, scores: Sequence[Score], gate: Gate
+) -> list[Omission]:
+    """What ingest, train and evaluate left out of this avatar and of its numbers."""
+    return [*_of_the_clip(evidence), *_of_the_avatar(gate), *_of_the_numbers(evidence, settings, scores)]
+
+
+def _of_the_clip(evidence: Evidence) -> list[Omission]:
+    footage = evidence.footage
+    dropped = [(reason, count) for reason, count in sorted(footage.dropped.items()) if count]
+    found = [Omission(_count(count, "frame"), reason) for reason, count in dropped]
+    if footage.people > 1:
+        why = f"{footage.people} people were noticed; the largest and most central one was followed"
+        found.append(Omission("Other people", why))
+    if footage.scale < 1:
+        why = f"frames were stored at {footage.scale:.2f} of their size (ingest.long_side)"
+        found.append(Omission("Finer detail", why))
+    return found
+
+
+def _of_the_avatar(gate: Gate) -> list[Omission]:
+    if gate.kept >= gate.vertices:
+        return []
+    share = 100 * (1 - gate.kept / gate.vertices)
+    why = (
+        f"{gate.vertices - gate.kept} of {gate.vertices} body vertices ({share:.0f}%) were seen in no "
+        "training frame, so no Gaussians stand there; in the turn one looks through those places"
+    )
+    return [Omission("What the clip never showed", why)]
+
+
+def _of_the_numbers(
+    evidence: Evidence, settings: EvaluateSettings, scores: Sequence[Score]
+) -> list[Omission]:
+    found = []
+    learnt_from = len(evidence.split.train)
+    if not evidence.split.test:
+        why = "every frame was trained on; the numbers say what was memorised"
+        found.append(Omission("Held-out numbers", why))
+    trained = sum(one.split == TRAINING and one.metric == "psnr" for one in scores)
+    if trained < learnt_from:
+        why = f"{trained} of {learnt_from} are scored, evenly spaced (evaluate.training_frames)"
+        found.append(Omission("Scores of the other training frames", why))
+    if evidence.split.test and 0 < settings.baseline_frames < learnt_from:
+        why = f"they draw on {settings.baseline_frames} of {learnt_from} (evaluate.baseline_frames)"
+        found.append(Omission("Training frames in the baselines", why))
+    for network in sorted(set(NETWORKS) - set(settings.lpips_networks)):
+        why = f"not asked for (evaluate.lpips_networks){_LPIPS_COST.get(network, '')}"
+        found.append(Omission(f"LPIPS with {network}", why))
+    if evidence.split.test:
+        why = (
+            "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels"
+        )
+        found.append(Omission("Test-time pose refinement", why))
+    bare = len({one.frame for one in scores if one.split == HELD_OUT and math.isnan(one.value)})
+    if bare:
+        found.append(Omission("Interior of " + _count(bare, "frame"), "the eroded mask is empty there"))
+    return found
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

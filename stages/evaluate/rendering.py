@@ -1,0 +1,43 @@
+"""From a pose to a picture. What makes Gaussians of a pose is passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.splat import Gaussians, Rendering, render
+from stages.evaluate.evidence import Evidence
+
+GREY = 0.82
+
+Animate = Callable[[Tensor, Tensor, Tensor, float | None], Gaussians]
+"""rotation [55, 3], expression [E], transl [3], time -> Gaussians in world coordinates.
+
+The real one is ``pipeline.avatar.Avatar.gaussians``.
+"""
+
+
+@torch.no_grad()
+def render_frame(animate: Animate, evidence: Evidence, index: int) -> Rendering:
+    """The avatar in a frame's pose, as that frame's camera sees it, of the stored frame's size."""
+    gaussians = animate(*evidence.pose(index), evidence.seconds(index))
+    return render(gaussians, evidence.cameras[index])
+
+
+def on_black(rendering: Rendering) -> Tensor:
+    """The picture that is scored: [H, W, 3] float32 in [0, 1]."""
+    return rendering.color.float().clamp(0, 1)
+
+
+def on_grey(rendering: Rendering) -> np.ndarray:
+    """The picture for people: dark hair and a white shirt both stand out; [H, W, 3] uint8 RGB."""
+    image = rendering.color + (1 - rendering.alpha[..., None]) * GREY
+    return to_bytes(image)
+
+
+def to_bytes(image: Tensor) -> np.ndarray:
+    """[H, W, 3] float, clamped to [0, 1] -> uint8."""
+    return (image.clamp(0, 1) * 255).round().byte().numpy()

@@ -1,0 +1,182 @@
+"""The evaluate stage: reads what the other stages published, judges the avatar, writes the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipeline import artifact
+from pipeline.avatar import load_avatar
+from pipeline.body import load_body
+from pipeline.frames import write_png, write_video
+from pipeline.job import shown
+from pipeline.metrics import EROSION, Lpips
+from pipeline.records import write_json
+from pipeline.settings import as_dict
+from pipeline.splat import Gaussians, render, write_ply
+from pipeline.stage import Context
+from stages.evaluate.assessment import Assessment, assess, scored_frames
+from stages.evaluate.curve import draw_curve, read_curve
+from stages.evaluate.evidence import Evidence, read_evidence
+from stages.evaluate.omissions import omissions
+from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
+from stages.evaluate.records import StageRecord, read_gate, stage_records
+from stages.evaluate.rendering import Animate, on_grey, render_frame
+from stages.evaluate.report import Material, write_report
+from stages.evaluate.scoring import Scorer, table, write_scores
+from stages.evaluate.settings import EvaluateSettings
+from stages.evaluate.summary import show_summary
+from stages.evaluate.turntable import orbit, relaxed_pose, turn_pictures, visible_extent
+
+PROTOCOL = (
+    "The person is composited on black and compared over the whole image at the stored size; each number is "
+    f"a mean over frames. PSNR is in dB; inside is within the mask (alpha above 0.5) eroded by {EROSION} px."
+)
+
+_COVER_HEIGHT = 400  # pixels
+
+
+def run(context: Context) -> None:
+    """Evaluates the trained avatar of one subject.
+
+    Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
+    ``turntable.mp4`` and ``avatar.ply``.
+
+    Raises:
+        UserError: a file of an upstream stage or an asset is missing or damaged.
+    """
+    avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", load_body(context.body_file))
+    networks = {name: Lpips(context.assets["lpips"], name) for name in context.settings.lpips_networks}
+    evaluate(context, read_evidence(context.inputs), avatar.gaussians, Scorer(networks))
+
+
+def evaluate(context: Context, evidence: Evidence, animate: Animate, scorer: Scorer) -> None:
+    """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``."""
+    settings: EvaluateSettings = context.settings
+    start = time.monotonic()
+    with context.progress(len(scored_frames(evidence, settings)), "scoring") as progress:
+        assessment = assess(evidence, animate, scorer, settings, progress.advance)
+    context.timing("scoring_seconds", time.monotonic() - start)
+    write_scores(context.output / "metrics.parquet", assessment.scores)
+    relaxed = relaxed_gaussians(evidence, animate, settings)
+    write_ply(context.output / "avatar.ply", relaxed)
+    write_turntable(context, relaxed)
+    cover = cover_pictures(evidence, animate, assessment, relaxed)
+    write_png(context.output / "cover.png", beside(cover))
+    sheet = comparison_sheet(assessment.comparisons, settings.error_gain)
+    write_png(context.output / "comparison.png", sheet)
+    summary = summarise(context, evidence, assessment, scorer, len(relaxed))
+    write_json(context.output / "summary.json", summary)
+    own = StageRecord("evaluate", as_dict(settings), time.monotonic() - start)
+    material = gather(context, evidence, assessment, summary, cover, own)
+    write_report(context.output / "report.html", material)
+    show_summary(summary, shown(report_place(context.output)))
+
+
+def gather(
+    context: Context,
+    evidence: Evidence,
+    assessment: Assessment,
+    summary: dict[str, Any],
+    cover: list[np.ndarray],
+    own: StageRecord,
+) -> Material:
+    """What the report shows, from this stage and from the upstream stages' folders."""
+    fit, train, settings = context.inputs["fit"], context.inputs["train"], context.settings
+    gate = read_gate(train / "visibility.parquet")
+    return Material(
+        summary=summary,
+        clip=describe_clip(evidence),
+        cover=cover,
+        comparisons=assessment.comparisons,
+        error_gain=settings.error_gain,
+        turntable=context.output / "turntable.mp4",
+        overlay=(fit / "overlay.mp4", fit / "overlay.png"),
+        curve=draw_curve(read_curve(train / "curve.parquet")),
+        omissions=omissions(evidence, settings, assessment.scores, gate),
+        stages=[*stage_records(context.inputs), own],
+    )
+
+
+@torch.no_grad()
+def relaxed_gaussians(evidence: Evidence, animate: Animate, settings: EvaluateSettings) -> Gaussians:
+    """The canonical avatar in the turn's pose, facing +Z at the origin, without expression."""
+    expression = torch.zeros(evidence.fitted.expression.shape[1])
+    return animate(relaxed_pose(settings.arm_angle), expression, torch.zeros(3), None)
+
+
+def write_turntable(context: Context, gaussians: Gaussians) -> None:
+    """Writes ``turntable.mp4``."""
+    settings: EvaluateSettings = context.settings
+    size = (settings.turntable_width, settings.turntable_height)
+    cameras = orbit(visible_extent(gaussians), *size, settings.turntable_frames)
+    start = time.monotonic()
+    with context.progress(len(cameras), "turntable") as progress:
+
+        def pictures() -> Iterator[np.ndarray]:
+            for picture in turn_pictures(gaussians, cameras):
+                yield picture
+                progress.advance()
+
+        write_video(context.output / "turntable.mp4", pictures(), settings.turntable_fps)
+    context.timing("turntable_seconds", time.monotonic() - start)
+
+
+def cover_pictures(
+    evidence: Evidence, animate: Animate, assessment: Assessment, relaxed: Gaussians
+) -> list[np.ndarray]:
+    """The report's cover: as filmed, the avatar in that pose, the avatar turned to either side.
+
+    Returns:
+        Four pictures [H, W, 3] uint8 RGB of one height, the first and the last two of one width.
+    """
+    frame = assessment.comparisons[len(assessment.comparisons) // 2].frame
+    left, top, right, bottom = person_box([evidence.mask(frame)])
+    posed = on_grey(render_frame(animate, evidence, frame))
+    turned = both_sides(relaxed)
+    filmed = evidence.frame(frame)[top:bottom, left:right]
+    return [resized(one, _COVER_HEIGHT) for one in (filmed, posed[top:bottom, left:right], *turned)]
+
+
+@torch.no_grad()
+def both_sides(gaussians: Gaussians) -> list[np.ndarray]:
+    """The avatar from its right and from its left, 40 degrees off the front, cut to what is seen."""
+    views = orbit(visible_extent(gaussians), 480, 640, 9)
+    renderings = [render(gaussians, view) for view in (views[-1], views[1])]
+    masks = [(rendering.alpha.clamp(0, 1) * 255).byte().numpy() for rendering in renderings]
+    left, top, right, bottom = person_box(masks)
+    return [on_grey(rendering)[top:bottom, left:right] for rendering in renderings]
+
+
+def summarise(
+    context: Context, evidence: Evidence, assessment: Assessment, scorer: Scorer, gaussians: int
+) -> dict[str, Any]:
+    """What ``summary.json`` holds."""
+    return {
+        "subject": context.subject,
+        "frames": {"train": len(evidence.split.train), "test": len(evidence.split.test)},
+        "gaussians": gaussians,
+        "metrics": list(scorer.metrics),
+        "means": table(assessment.scores, scorer.metrics),
+        "nearest": {str(frame): nearest for frame, nearest in sorted(assessment.nearest.items())},
+        "protocol": PROTOCOL,
+    }
+
+
+def describe_clip(evidence: Evidence) -> str:
+    """One sentence on where the avatar comes from."""
+    footage = evidence.footage
+    frames = f"{len(evidence.split.train)} frames to learn from and {len(evidence.split.test)} held out"
+    return f"Made from {footage.name} ({footage.width} × {footage.height}): {frames}."
+
+
+def report_place(output: Path) -> Path:
+    """Where the report lies once the stage's result is published."""
+    if output.parent.name.startswith(artifact.SCRATCH):
+        return output.parent.parent / artifact.LATEST / "report.html"
+    return output / "report.html"

@@ -1,0 +1,109 @@
+"""A tiny subject for the evaluate stage: a blob of Gaussians, filmed by the renderer itself."""
+
+import dataclasses
+
+import torch
+
+from pipeline.body import Poses, write_poses
+from pipeline.camera import facing_camera
+from pipeline.frames import write_frame, write_mask
+from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.splat import Gaussians, render
+from pipeline.stage import Context
+from stages.evaluate.evidence import read_evidence
+from stages.evaluate.run import evaluate
+from stages.evaluate.scoring import Scorer
+from stages.evaluate.settings import EvaluateSettings
+from stages.train.curve import Curve
+from stages.train.visibility import Visibility, write_visibility
+
+FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
+TEST = FRAMES[-3:]
+WIDTH, HEIGHT = 64, 48
+
+
+def stand_in(rotation, expression, transl, time):
+    """A blob of 40 Gaussians that follows ``transl`` and leans with the root's rotation."""
+    generator = torch.Generator().manual_seed(7)
+    draw = torch.rand(40, 3, generator=generator)
+    means = (draw - 0.5) * torch.tensor([0.6, 0.8, 0.3]) + transl
+    means = means + torch.linalg.cross(rotation[:1].expand(40, 3), means - transl)
+    quaternions = torch.tensor([[1.0, 0, 0, 0]]).expand(40, 4)
+    scales = torch.full((40, 3), 0.09)
+    return Gaussians(
+        means, quaternions, scales, torch.rand(40, 3, generator=generator), torch.full((40,), 0.99)
+    )
+
+
+def wrong(rotation, expression, transl, time):
+    """The same blob in other colours."""
+    right = stand_in(rotation, expression, transl, time)
+    return dataclasses.replace(right, colors=1 - right.colors)
+
+
+def moving_poses(shift=0.0):
+    count = len(FRAMES)
+    transl = torch.tensor([0.0, 0.0, -2.0]).repeat(count, 1)
+    transl[:, 0] = torch.linspace(-0.2, 0.3, count) + shift
+    rotation = torch.zeros(count, 55, 3)
+    rotation[:, 0, 2] = torch.linspace(0, 0.3, count)
+    return Poses(FRAMES, rotation, torch.zeros(count, 4), transl)
+
+
+@dataclasses.dataclass
+class Clip:
+    """A subject as the upstream stages publish it, filmed of the stand-in avatar."""
+
+    root: object
+    inputs: dict
+
+    def context(self, name="out", **settings):
+        output, work = self.root / name, self.root / f"{name}-work"
+        output.mkdir()
+        settings = {"turntable_frames": 4, "turntable_width": 48, "turntable_height": 64, **settings}
+        return Context(
+            subject="blob",
+            settings=EvaluateSettings(lpips_networks=(), **settings),
+            inputs=self.inputs,
+            assets={},
+            source=None,
+            body=self.root,
+            body_file=self.root / "body.npz",
+            output=output,
+            work=work,
+            stage="evaluate",
+        )
+
+    def evaluate(self, animate=stand_in, name="out", **settings):
+        context = self.context(name, **settings)
+        evaluate(context, read_evidence(self.inputs), animate, Scorer({}))
+        return context.output
+
+
+def make_clip(root, test=TEST):
+    inputs = {name: root / name for name in ("ingest", "fit", "train")}
+    for folder in (*inputs.values(), inputs["ingest"] / "frames", inputs["ingest"] / "masks"):
+        folder.mkdir()
+    ingest, fit, train = inputs.values()
+    camera, poses = facing_camera(WIDTH, HEIGHT, 70.0), moving_poses()
+    for row, frame in enumerate(FRAMES):
+        rendering = render(stand_in(poses.rotation[row], None, poses.transl[row], None), camera)
+        seen = rendering.alpha > 0
+        write_frame(ingest / "frames", frame, (rendering.color * 255).round().byte().numpy())
+        write_mask(ingest / "masks", frame, (seen * 255).byte().numpy())
+    write_cameras(ingest / "cameras.parquet", dict.fromkeys(FRAMES, camera))
+    write_split(ingest / "split.json", Split(tuple(f for f in FRAMES if f not in test), test))
+    dropped = {"no person was found": 2, "unreadable": 0}
+    seconds = tuple(frame / 25 for frame in FRAMES)
+    footage = Footage("blob.mp4", 128, 96, 25.0, 0.5, 14, 12, dropped, 2, seconds, {"masks": "made"})
+    write_footage(ingest / "footage.json", footage)
+    write_poses(fit / "poses.parquet", poses)
+    write_poses(train / "poses.parquet", poses)
+    points = Curve()
+    for iteration in (10, 20, 30):
+        points.count({"l1": 1 / iteration, "ssim": 0.5 / iteration, "offset": 1e-3, "pose_offset": 1e-4})
+        points.point(iteration, {"psnr": 20.0 + iteration, "gaussians": 40.0, "learning_rate": 1e-3})
+    points.write(train / "curve.parquet")
+    kept = torch.arange(50) < 40
+    write_visibility(train / "visibility.parquet", Visibility(3, kept.long() * 3, kept.float(), kept))
+    return Clip(root, inputs)

@@ -1,0 +1,260 @@
+import dataclasses
+import io
+import json
+import re
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from rich.console import Console
+
+from pipeline.body import Poses, write_poses
+from pipeline.errors import UserError
+from pipeline.frames import write_mask
+from pipeline.metrics import PSNR_CAP
+from pipeline.splat import read_ply
+from stages.evaluate import STAGE, curve, records
+from stages.evaluate.evidence import evenly, read_evidence
+from stages.evaluate.run import evaluate, report_place
+from stages.evaluate.scoring import Scorer
+from stages.evaluate.settings import EvaluateSettings
+from stages.evaluate.summary import show_summary
+from stages.evaluate.turntable import relaxed_pose
+from stages.train.visibility import SCHEMA as VISIBILITY
+from tests.stages.evaluate_subject import (
+    FRAMES,
+    HEIGHT,
+    TEST,
+    WIDTH,
+    make_clip,
+    moving_poses,
+    stand_in,
+    wrong,
+)
+
+
+@pytest.fixture
+def clip(tmp_path):
+    return make_clip(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """One evaluation that many tests look at and none changes."""
+    return make_clip(tmp_path_factory.mktemp("blob")).evaluate()
+
+
+# What is published
+
+
+def test_everything_named_is_published(published):
+    names = {path.name for path in published.iterdir()}
+    pictures = {"comparison.png", "cover.png", "turntable.mp4"}
+    assert names == {"metrics.parquet", "summary.json", "report.html", "avatar.ply", *pictures}
+
+
+def test_the_avatar_that_made_the_clip_scores_as_its_eight_bits_allow(published):
+    means = json.loads((published / "summary.json").read_text())["means"]
+    # Rounding to 8 bits leaves an error of 1/255 / sqrt(12): 58.9 dB where every pixel is coloured.
+    for split in ("test", "train"):
+        assert 58 < means[split]["avatar"]["psnr"] < PSNR_CAP
+        assert 58 < means[split]["avatar"]["psnr_interior"] < 61
+        assert means[split]["avatar"]["ssim"] > 0.999
+
+
+def test_the_baselines_stand_beside_it(published):
+    summary = json.loads((published / "summary.json").read_text())
+    held_out = summary["means"]["test"]
+    assert held_out["mean_frame"]["psnr"] < held_out["nearest_frame"]["psnr"] < held_out["avatar"]["psnr"]
+    # The blob moves one way, so the last training frame is nearest to all that follow.
+    assert summary["nearest"] == {str(frame): FRAMES[-4] for frame in TEST}
+    assert "mean_frame" not in summary["means"]["train"]
+
+
+def test_every_frame_has_a_row(published):
+    rows = pq.read_table(published / "metrics.parquet").to_pylist()
+    assert set(rows[0]) == {"frame", "split", "method", "metric", "value"}
+    held_out = {(row["frame"], row["method"], row["metric"]) for row in rows if row["split"] == "test"}
+    metrics, methods = ("psnr", "psnr_interior", "ssim"), ("avatar", "mean_frame", "nearest_frame")
+    assert held_out == {(frame, method, metric) for frame in TEST for method in methods for metric in metrics}
+    trained = {row["frame"] for row in rows if row["split"] == "train"}
+    assert trained == set(evenly([frame for frame in FRAMES if frame not in TEST], 8))
+
+
+def test_summary_holds_the_means_of_the_rows(published):
+    summary = json.loads((published / "summary.json").read_text())
+    rows = pq.read_table(published / "metrics.parquet").to_pylist()
+    wanted = ("test", "nearest_frame", "psnr")
+    values = [row["value"] for row in rows if (row["split"], row["method"], row["metric"]) == wanted]
+    assert summary["means"]["test"]["nearest_frame"]["psnr"] == pytest.approx(np.mean(values), abs=1e-6)
+    assert (summary["gaussians"], summary["frames"]) == (40, {"train": 9, "test": 3})
+
+
+def test_the_ply_holds_the_turned_avatar(published):
+    found = read_ply(published / "avatar.ply")
+    expected = stand_in(relaxed_pose(1.0), torch.zeros(4), torch.zeros(3), None)
+    assert torch.allclose(found.means, expected.means, atol=1e-6)
+
+
+def test_the_same_inputs_give_the_same_bytes(clip):
+    first, second = clip.evaluate(name="first"), clip.evaluate(name="second")
+    for path in first.iterdir():
+        if path.name != "report.html":  # it shows how long the stages took
+            assert path.read_bytes() == (second / path.name).read_bytes(), path.name
+
+
+def test_a_wrong_avatar_scores_low_and_is_not_marked_best(clip):
+    output = clip.evaluate(wrong)
+    held_out = json.loads((output / "summary.json").read_text())["means"]["test"]
+    assert held_out["avatar"]["psnr"] < held_out["nearest_frame"]["psnr"]
+    assert f"<b>{held_out['avatar']['psnr']:.2f}</b>" not in (output / "report.html").read_text()
+
+
+def test_held_out_frames_are_shown_in_the_fits_pose_and_training_frames_in_the_refined(clip):
+    write_poses(clip.inputs["train"] / "poses.parquet", moving_poses(shift=5.0))
+    evidence = read_evidence(clip.inputs)
+    assert float(evidence.pose(TEST[0])[2][0]) < 1 < float(evidence.pose(FRAMES[0])[2][0])
+    assert evidence.seconds(TEST[0]) == TEST[0] / 25
+    assert evidence.seconds(999) is None
+
+
+def test_a_frame_without_pose_says_what_to_run(clip):
+    poses = moving_poses()
+    fewer = Poses(FRAMES[:-1], poses.rotation[:-1], poses.expression[:-1], poses.transl[:-1])
+    for stage in ("fit", "train"):
+        write_poses(clip.inputs[stage] / "poses.parquet", fewer)
+    with pytest.raises(UserError, match=f"frame {FRAMES[-1]} has no pose.*fit"):
+        clip.evaluate()
+
+
+def test_a_clip_without_held_out_frames_is_reported_as_such(tmp_path):
+    output = make_clip(tmp_path, test=()).evaluate()
+    means = json.loads((output / "summary.json").read_text())["means"]
+    assert set(means) == {"train"}
+    report = (output / "report.html").read_text()
+    assert "Frames it was trained on" in report and "what was memorised" in report
+
+
+def test_a_frame_whose_mask_is_empty_has_no_interior(clip):
+    write_mask(clip.inputs["ingest"] / "masks", TEST[1], np.zeros((HEIGHT, WIDTH), np.uint8))
+    output = clip.evaluate()
+    rows = pq.read_table(output / "metrics.parquet").to_pylist()
+    inside = {row["frame"] for row in rows if row["metric"] == "psnr_interior" and row["split"] == "test"}
+    assert inside == {TEST[0], TEST[2]}
+    assert "Interior of 1 frame" in (output / "report.html").read_text()
+
+
+# The report
+
+
+def test_the_report_needs_nothing_but_itself(published):
+    report = (published / "report.html").read_text()
+    sources = re.findall(r'\b(?:src|href|poster|srcset|action|data)="([^"]*)"', report)
+    assert sources and all(source.startswith(("data:", "#")) for source in sources)
+    assert not re.search(r"@import|<script|<link|<iframe|url\(\s*['\"]?(?!#)", report)
+    assert "default-src 'none'" in report
+
+
+def test_the_report_shows_what_it_must(published):
+    report = (published / "report.html").read_text()
+    summary = json.loads((published / "summary.json").read_text())
+    assert f"{summary['means']['test']['avatar']['psnr']:.2f}" in report
+    assert report.count("<video") == 1 and "<svg" in report  # no overlay was published by this fit
+    assert report.count("ground truth, render, error × 3") == 3
+    for text in ("no person was found", "2 people were noticed", "10 of 50 body vertices", "avatar.ply"):
+        assert text in report, text
+    assert "evaluate.error_gain" in report and "unreadable" not in report
+
+
+def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip):
+    fit = clip.inputs["fit"]
+    (fit / "run.json").write_text('{"seconds": 12.34}')
+    (fit / "manifest.json").write_text('{"settings": {"iterations": 400, "odd": ["a", "b"]}}')
+    (clip.inputs["train"] / "run.json").write_text("{broken")
+    report = (clip.evaluate() / "report.html").read_text()
+    assert "12.3" in report and "fit.iterations" in report and "a, b" in report
+    assert report.count("not recorded") == 2
+
+
+def test_what_users_name_is_escaped(clip):
+    context = dataclasses.replace(clip.context(), subject="<script>x</script>")
+    evaluate(context, read_evidence(clip.inputs), stand_in, Scorer({}))
+    assert "<script>" not in (context.output / "report.html").read_text()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("overlay.mp4", "<video"), ("overlay.png", "<img")])
+def test_the_fits_overlay_is_embedded(clip, name, kind):
+    (clip.inputs["fit"] / name).write_bytes(b"any bytes")
+    report = (clip.evaluate() / "report.html").read_text()
+    assert re.search(rf'{kind} src="data:[a-z0-9/]+;base64,YW55IGJ5dGVz"', report)
+
+
+def test_curve_and_visibility_are_read_as_train_writes_them(clip):
+    lines = curve.read_curve(clip.inputs["train"] / "curve.parquet")
+    assert lines["psnr"] == [(10, 30.0), (20, 40.0), (30, 50.0)]
+    assert records.read_gate(clip.inputs["train"] / "visibility.parquet") == records.Gate(40, 50)
+    assert VISIBILITY.field("kept") == records.VISIBILITY.field("kept")
+    with pytest.raises(UserError, match="train stage again"):
+        curve.read_curve(clip.inputs["train"] / "visibility.parquet")
+
+
+def test_the_curve_adds_the_regularisers_up_and_is_drawn_the_same_each_time():
+    lines = {
+        "l1": [(1, 0.5)],
+        "offset": [(1, 0.25), (2, 0.5)],
+        "pose_offset": [(2, 0.25)],
+        "psnr": [(2, 20.0)],
+    }
+    assert curve._loss_lines(lines) == {"L1": [(1, 0.5)], "regularisers": [(1, 0.25), (2, 0.75)]}
+    assert curve.draw_curve(lines) == curve.draw_curve(lines)
+    assert curve.draw_curve({}) == curve.draw_curve({"gaussians": [(1, 40.0)]}) == []
+    assert len(curve.draw_curve(lines)) == 2
+
+
+# The terminal
+
+
+def summary_text(summary, path, **console):
+    text = io.StringIO()
+    show_summary(summary, str(path), Console(file=text, **console))
+    return text.getvalue()
+
+
+def test_the_terminal_summary_ends_with_the_reports_path(published):
+    summary = json.loads((published / "summary.json").read_text())
+    path = published / ("deep/" * 40) / "report.html"
+    plain = summary_text(summary, path)
+    assert plain.splitlines()[-1] == f"report: {path}"
+    assert "\x1b" not in plain and "nearest training frame" in plain and len(plain.splitlines()) < 12
+    coloured = summary_text(summary, path, force_terminal=True, width=80)
+    assert "\x1b[1m" in coloured and coloured.splitlines()[-1].endswith("report.html")
+
+
+def test_the_path_is_where_the_store_will_publish(tmp_path):
+    scratch = tmp_path / "evaluate" / ".scratch-abc" / "output"
+    assert report_place(scratch) == tmp_path / "evaluate" / "latest" / "report.html"
+    assert report_place(tmp_path) == tmp_path / "report.html"
+
+
+# Settings and declaration
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"lpips_networks": ("alex", "squeeze")}, "alex and vgg, not squeeze"),
+        ({"turntable_width": 481}, "turntable_width must be even"),
+        ({"training_frames": 0}, "training_frames must be at least 1"),
+        ({"baseline_frames": -1}, "baseline_frames must be at least 0"),
+        ({"error_gain": 0.0}, "error_gain must be above 0"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        EvaluateSettings(**settings)
+
+
+def test_the_stage_reads_what_it_declares():
+    assert STAGE.settings is EvaluateSettings and STAGE.assets == ("lpips",)
+    assert set(STAGE.needs) == {"ingest", "fit", "train"}
