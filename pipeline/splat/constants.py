@@ -1,0 +1,33 @@
+"""Image formation: what every backend of ``render`` computes, and the numbers that it shares.
+
+A Gaussian with mean m, unit quaternion q, scales s, opacity o and colour c (3D Gaussian splatting,
+Kerbl et al. 2023; EWA splatting, Zwicker et al. 2001; the constants are gsplat's):
+
+* in the camera ``x = R m + t``; seen when ``NEAR <= x_z <= FAR``;
+* its image is a Gaussian with mean ``K x / x_z`` and covariance ``J R M S S Mᵀ Rᵀ Jᵀ + DILATION I``, where M
+  is the rotation matrix of q, S = diag(s), and J the Jacobian of the projection at x. The ratios x_x/x_z
+  and x_y/x_z that enter J (not those that enter the mean) are clamped to the image and a margin around it,
+  because the linearisation is of no use far outside;
+* at a pixel centre at the offset d from the mean, ``sigma = d · conic · d / 2`` and
+  ``alpha = min(ALPHA_MAX, o exp(-sigma))``, skipped under ALPHA_MIN;
+* front to back in order of depth (compared in single precision, equal ones in order of index),
+  ``weight = alpha T`` and ``T <- T (1 - alpha)``, T starting at one. The first Gaussian that would take T to
+  TRANSMITTANCE_MIN or below is not drawn, and ends its pixel;
+* ``colour = sum weight c``, ``depth = sum weight x_z``, ``alpha = 1 - T``.
+
+A Gaussian is left out of all of this, and has no gradient, when one of its numbers is not finite, when its
+quaternion's length is outside [QUATERNION_MIN, QUATERNION_MAX], when its covariance in the image exceeds
+COVARIANCE_MAX, or when it does not touch the image.
+"""
+
+from __future__ import annotations
+
+NEAR = 0.01  # metres
+FAR = 1e10  # metres
+DILATION = 0.3  # pixels squared, added to the variance in the image
+ALPHA_MAX = 0.999
+ALPHA_MIN = 1.0 / 255.0
+TRANSMITTANCE_MIN = 1e-4
+JACOBIAN_MARGIN = 0.3  # of half the field of view, to each side of the image
+QUATERNION_MIN, QUATERNION_MAX = 1e-12, 1e12
+COVARIANCE_MAX = 1e16  # pixels squared: its square is still finite in single precision

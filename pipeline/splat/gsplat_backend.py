@@ -1,0 +1,67 @@
+"""The GPU rasterizer: gsplat 1.5.3."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.splat import constants
+from pipeline.splat.dense import usable
+from pipeline.splat.gaussians import Gaussians, Rendering
+
+
+def render_gsplat(gaussians: Gaussians, camera: Camera) -> Rendering:
+    """Render as ``constants`` says, on CUDA, in float32.
+
+    gsplat lets NaN through its projection and treats what is not finite as drawn, so only usable Gaussians
+    reach it.
+
+    Raises:
+        UserError: gsplat is not installed, or could not build its CUDA code.
+    """
+    rasterization = _rasterization()
+    dtype = gaussians.means.dtype
+    index = usable(gaussians, camera).nonzero()[:, 0]
+    drawn = gaussians.select(index).to(torch.float32)
+    camera = camera.to(torch.float32)
+    # gsplat does not say how much of each Gaussian is seen. The sum over the image of weight * value has each
+    # Gaussian's summed weight as its derivative, so a fourth colour, whose value does not matter, tells.
+    with torch.enable_grad():
+        probe = torch.ones(len(drawn), 1, device=drawn.means.device, requires_grad=True)
+        image, alpha, _ = rasterization(
+            means=drawn.means,
+            quats=drawn.quaternions,
+            scales=drawn.scales,
+            opacities=drawn.opacities,
+            colors=torch.cat([drawn.colors, probe], 1),
+            viewmats=camera.world_to_camera[None],
+            Ks=camera.intrinsics.detach()[None],
+            width=camera.width,
+            height=camera.height,
+            near_plane=constants.NEAR,
+            far_plane=constants.FAR,
+            eps2d=constants.DILATION,
+            render_mode="RGB+D",
+            packed=False,
+        )
+        (seen,) = torch.autograd.grad(image[..., 3].sum(), probe, retain_graph=True)
+    weights = torch.zeros(len(gaussians), device=seen.device).index_copy(0, index, seen[:, 0])
+    tensors: list[Tensor] = [image[0, ..., :3], alpha[0, ..., 0], image[0, ..., 4], weights]
+    if not torch.is_grad_enabled():
+        tensors = [tensor.detach() for tensor in tensors]  # from the graph that the probe brought in
+    return Rendering(*(tensor.to(dtype) for tensor in tensors))
+
+
+def _rasterization():
+    """The entry point of gsplat."""
+    try:
+        from gsplat import rasterization
+    except ImportError as error:
+        raise UserError(
+            f"rendering on CUDA needs gsplat 1.5.3, which cannot be imported ({error}): "
+            "pip install 'flexiavatar[gpu]' (it compiles on first use, with nvcc, a C++ compiler and ninja), "
+            "or render on the CPU"
+        ) from None
+    return rasterization

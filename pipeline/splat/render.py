@@ -1,0 +1,58 @@
+"""The one way to render: ``render(gaussians, camera)``."""
+
+from __future__ import annotations
+
+import torch
+
+from pipeline.camera import Camera
+from pipeline.splat.gaussians import Gaussians, Rendering
+
+BACKENDS = ("auto", "numba", "gsplat", "dense")
+
+
+def render(gaussians: Gaussians, camera: Camera, backend: str = "auto") -> Rendering:
+    """Render Gaussians over black, differentiably.
+
+    Gradients reach every tensor of ``gaussians`` and the camera's rotation and translation (not its
+    intrinsics). A Gaussian that cannot be drawn (a number that is not finite, no orientation, behind the
+    camera, ...: see ``constants``) is left out and has a gradient of zero; the others do not notice.
+
+    Args:
+        gaussians: in world coordinates. float64 is kept, everything else is computed in float32.
+        camera: moved to the Gaussians' device and dtype.
+        backend: "numba" (CPU), "gsplat" (CUDA), "dense" (plain torch, for small cases and as a reference), or
+            "auto": gsplat for CUDA tensors, else numba.
+
+    Returns:
+        The image, in the dtype of the computation.
+
+    Raises:
+        ValueError: no such backend, an empty image, or tensors on a device that the backend does not serve.
+        UserError: gsplat is asked for and not installed.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"an image of {camera.width} x {camera.height} pixels cannot be rendered")
+    device = gaussians.means.device
+    if backend == "auto":
+        backend = "gsplat" if device.type == "cuda" else "numba"
+    if backend == "numba" and device.type != "cpu":
+        raise ValueError(f"backend 'numba' renders CPU tensors, not {device.type}")
+    if backend == "gsplat" and device.type != "cuda":
+        raise ValueError(f"backend 'gsplat' renders CUDA tensors, not {device.type}")
+
+    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
+    gaussians, camera = gaussians.to(dtype), camera.to(device=device, dtype=dtype)
+    # Each backend's libraries are heavy, and a machine may have one of them only.
+    if backend == "numba":
+        from pipeline.splat.numba_backend import render_numba
+
+        return render_numba(gaussians, camera)
+    if backend == "gsplat":
+        from pipeline.splat.gsplat_backend import render_gsplat
+
+        return render_gsplat(gaussians, camera)
+    from pipeline.splat.dense import render_dense
+
+    return render_dense(gaussians, camera)

@@ -1,0 +1,107 @@
+"""Gaussians to a .ply and back."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from pipeline.errors import UserError
+from pipeline.splat import Gaussians, read_ply, render, write_ply
+from tests.unit.splat_scene import scene
+
+PROPERTIES = (
+    "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+)
+
+
+def test_the_round_trip_renders_the_same_picture(tmp_path):
+    gaussians, camera = scene(60, 40, 30, torch.float32)
+    write_ply(tmp_path / "avatar.ply", gaussians)
+    again = read_ply(tmp_path / "avatar.ply")
+    assert torch.equal(again.means, gaussians.means)
+    assert torch.allclose(render(again, camera).color, render(gaussians, camera).color, atol=1e-5)
+
+
+def test_the_file_is_laid_out_as_viewers_expect(tmp_path):
+    gaussians, _ = scene(5, 8, 8, torch.float32)
+    write_ply(tmp_path / "avatar.ply", gaussians)
+    header, body = (tmp_path / "avatar.ply").read_bytes().split(b"end_header\n", 1)
+    lines = header.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 5"]
+    assert lines[3:] == [f"property float {name}" for name in PROPERTIES]
+    first = dict(zip(PROPERTIES, np.frombuffer(body, "<f4")[:17].tolist(), strict=True))
+    assert first["scale_1"] == pytest.approx(np.log(gaussians.scales[0, 1]))
+    assert 1 / (1 + np.exp(-first["opacity"])) == pytest.approx(gaussians.opacities[0].item())
+    assert 0.5 + 0.28209479 * first["f_dc_2"] == pytest.approx(gaussians.colors[0, 2].item())
+    unit = gaussians.quaternions[0] / gaussians.quaternions[0].norm()
+    assert [first[f"rot_{k}"] for k in range(4)] == pytest.approx(unit.tolist())
+
+
+def test_another_library_reads_it(tmp_path):
+    gaussians, _ = scene(5, 8, 8, torch.float32)
+    write_ply(tmp_path / "avatar.ply", gaussians)
+    assert np.allclose(trimesh.load(tmp_path / "avatar.ply").vertices, gaussians.means)
+
+
+def test_the_ends_of_the_ranges_stay_finite(tmp_path):
+    gaussians, camera = scene(4, 20, 20, torch.float32)
+    edges = Gaussians(
+        gaussians.means,
+        gaussians.quaternions,
+        gaussians.scales * torch.tensor([1.0, 0.0, 1.0]),
+        gaussians.colors,
+        torch.tensor([0.0, 1.0, 1.5, 0.5]),
+    )
+    write_ply(tmp_path / "avatar.ply", edges)
+    again = read_ply(tmp_path / "avatar.ply")
+    assert all(tensor.isfinite().all() for tensor in again.tensors())
+    clamped = Gaussians(*edges.tensors()[:4], edges.opacities.clamp(max=1))
+    assert torch.allclose(render(again, camera).color, render(clamped, camera).color, atol=1e-5)
+
+
+def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path):
+    gaussians, _ = scene(4, 8, 8, torch.float32)
+    gaussians.means[1, 0] = float("nan")
+    gaussians.quaternions[2] = 0
+    write_ply(tmp_path / "avatar.ply", gaussians)
+    assert torch.equal(read_ply(tmp_path / "avatar.ply").means, gaussians.means[[0, 3]])
+
+
+def test_other_programs_extra_properties_are_ignored(tmp_path):
+    gaussians, _ = scene(3, 8, 8, torch.float32)
+    write_ply(tmp_path / "avatar.ply", gaussians)
+    header, body = (tmp_path / "avatar.ply").read_bytes().split(b"end_header\n", 1)
+    rows = np.frombuffer(body, "<f4").reshape(3, 17)
+    header = header.replace(b"property float opacity\n", b"property float f_rest_0\nproperty float opacity\n")
+    rows = np.insert(rows, 9, 7.0, axis=1)
+    (tmp_path / "other.ply").write_bytes(header + b"end_header\n" + rows.tobytes())
+    for ours, theirs in zip(
+        gaussians.tensors()[2:], read_ply(tmp_path / "other.ply").tensors()[2:], strict=True
+    ):
+        assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data[:-1], "truncated"),
+        (lambda data: b"", "not a binary"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "not a binary"),
+        (lambda data: data.replace(b"float opacity", b"float other"), "lacks opacity"),
+        (lambda data: data.replace(b"float opacity", b"double opacity"), "not float"),
+        (lambda data: data.replace(b"vertex", b"face"), "vertices and nothing else"),
+        (lambda data: data.replace(b"element vertex 2", b"element vertex"), "vertices and nothing else"),
+    ],
+)
+def test_a_spoilt_file_is_one_clear_line(tmp_path, spoil, message):
+    path = tmp_path / "avatar.ply"
+    write_ply(path, scene(2, 8, 8, torch.float32)[0])
+    path.write_bytes(spoil(path.read_bytes()))
+    with pytest.raises(UserError, match=message) as error:
+        read_ply(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_file_is_one_clear_line(tmp_path):
+    with pytest.raises(UserError, match=r"none\.ply"):
+        read_ply(tmp_path / "none.ply")
