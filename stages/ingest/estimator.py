@@ -1,0 +1,188 @@
+"""MediaPipe 0.10.21: one person's landmarks and soft segmentations, and a finder of people.
+
+The package is an asset, not a dependency: its folder is put on the path when an estimator is made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.errors import UserError
+from stages.ingest.people import Person
+
+_FINDER_GRAPH = """
+input_stream: "image"
+output_stream: "detections"
+node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
+"""
+BOX_LEVEL, BOX_MARGIN = 0.3, 0.12  # the person's box: where the pose mask exceeds this, and this much around
+_BLANK = np.zeros((64, 64, 3), np.uint8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What MediaPipe saw in one picture; every coordinate as a fraction of the picture's size.
+
+    z has the scale of x, smaller nearer to the camera. What was not found is None.
+
+    Attributes:
+        pose: [33, 4], x, y, z, visibility.
+        world: [33, 4], metres about the hips, visibility.
+        face: [478, 3], x, y, z.
+        hands: left and right, [21, 3] each.
+        body_mask: [H, W] float32 in [0, 1], the pose model's segmentation.
+        selfie_mask: [H, W] float32 in [0, 1], the segmentation made for heads and upper bodies,
+            of the person's box; 0 outside it.
+    """
+
+    pose: np.ndarray
+    world: np.ndarray
+    face: np.ndarray | None
+    hands: tuple[np.ndarray | None, np.ndarray | None]
+    body_mask: np.ndarray
+    selfie_mask: np.ndarray
+
+
+class Estimator:
+    """Follows one person through a clip; pictures must come in order."""
+
+    def __init__(self, asset: Path, native_log: Path) -> None:
+        """Load the models from the asset's folder; UserError if they cannot be loaded.
+
+        Args:
+            asset: the folder that holds ``mediapipe/``.
+            native_log: where the models' native code may write its remarks.
+        """
+        solutions = _load(asset)
+        self._native_log = native_log
+        with _aside(native_log):
+            self._holistic = solutions.holistic.Holistic(
+                model_complexity=1,
+                enable_segmentation=True,
+                smooth_segmentation=False,  # masks are made steady later, along the motion
+                refine_face_landmarks=True,
+            )
+            self._selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+            self._holistic.process(_BLANK), self._selfie.process(_BLANK)  # the models finish loading here
+
+    def estimate(self, image: np.ndarray) -> Estimate | None:
+        """The person in ``image`` [H, W, 3] uint8 RGB, or None where there is none."""
+        with _aside(self._native_log):
+            found = self._holistic.process(image)
+        if found.pose_landmarks is None or found.segmentation_mask is None:
+            return None
+        world = _array(found.pose_world_landmarks, visibility=True)
+        pose = _array(found.pose_landmarks, visibility=True)
+        if pose is None or world is None:
+            return None
+        hands = (_array(found.left_hand_landmarks), _array(found.right_hand_landmarks))
+        body = np.clip(found.segmentation_mask, 0, 1)
+        return Estimate(pose, world, _array(found.face_landmarks), hands, body, self._segment(image, body))
+
+    def _segment(self, image: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """The selfie segmentation of the person's box, where its 256 pixels go further than on the whole."""
+        rows, columns = (np.flatnonzero((body > BOX_LEVEL).any(axis)) for axis in (1, 0))
+        whole = np.zeros_like(body)
+        if not len(rows):
+            return whole
+        box = []
+        for places, length in ((rows, body.shape[0]), (columns, body.shape[1])):
+            margin = round(BOX_MARGIN * (places[-1] + 1 - places[0]))
+            box.append(slice(max(0, places[0] - margin), min(length, places[-1] + 1 + margin)))
+        part = np.ascontiguousarray(image[box[0], box[1]])
+        with _aside(self._native_log):
+            whole[box[0], box[1]] = np.clip(self._selfie.process(part).segmentation_mask, 0, 1)
+        return whole
+
+
+class Finder:
+    """Finds every person in a picture, without following anyone."""
+
+    def __init__(self, asset: Path, native_log: Path) -> None:
+        """Load the person detector; arguments and errors as those of :class:`Estimator`."""
+        _load(asset)
+        self._native_log = native_log
+        from google.protobuf import text_format
+
+        base = importlib.import_module("mediapipe.python.solution_base")
+        messages = importlib.import_module("mediapipe.framework.calculator_pb2")
+        graph = text_format.Parse(_FINDER_GRAPH, messages.CalculatorGraphConfig())
+        with _aside(native_log):
+            self._graph = base.SolutionBase(graph_config=graph, outputs=["detections"])
+            self._graph.process(_BLANK)
+
+    def find(self, image: np.ndarray) -> list[Person]:
+        """The people in ``image`` [H, W, 3] uint8 RGB; coordinates in its pixels."""
+        height, width = image.shape[:2]
+        with _aside(self._native_log):
+            found = self._graph.process(image).detections or []
+        people = []
+        for detection in found:
+            points = [(p.x * width, p.y * height) for p in detection.location_data.relative_keypoints]
+            hips, rim, shoulders = (np.array(point) for point in points[:3])
+            radius = float(np.linalg.norm(rim - hips))
+            people.append(Person(hips, shoulders, radius, float(detection.score[0])))
+        return people
+
+
+def estimator_scale(width: int, height: int, short_side: int, long_side: int) -> float:
+    """By how much a picture is resized for the estimator; small ones grow, to three times at most."""
+    if max(width, height) > long_side:
+        return long_side / max(width, height)
+    most = min(3, max(1, long_side // max(width, height)))
+    return float(np.clip(round(short_side / min(width, height)), 1, most))
+
+
+def resize(image: np.ndarray, scale: float) -> np.ndarray:
+    """``image`` resized by ``scale``, averaged where it shrinks and interpolated where it grows."""
+    if scale == 1:
+        return image
+    size = tuple(max(1, round(side * scale)) for side in image.shape[1::-1])
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+
+
+def _load(asset: Path) -> Any:
+    """``mediapipe.solutions`` from the asset's folder."""
+    os.environ.setdefault("GLOG_minloglevel", "3")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    if str(asset) not in sys.path:
+        sys.path.insert(0, str(asset))
+    try:
+        return importlib.import_module("mediapipe.python.solutions")
+    except ImportError as error:
+        raise UserError(
+            f"{asset} cannot be loaded as MediaPipe ({error}): fetch it again (doit run assets:mediapipe), "
+            "with Python 3.11 or 3.12"
+        ) from None
+
+
+@contextlib.contextmanager
+def _aside(log: Path) -> Iterator[None]:
+    """What native code prints to the terminal's error stream goes to ``log`` instead."""
+    sys.stderr.flush()
+    kept, target = os.dup(2), os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    try:
+        os.dup2(target, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(target)
+
+
+def _array(landmarks: Any, visibility: bool = False) -> np.ndarray | None:
+    if landmarks is None:
+        return None
+    points = [(p.x, p.y, p.z, p.visibility) if visibility else (p.x, p.y, p.z) for p in landmarks.landmark]
+    array = np.array(points, np.float32)
+    return array if np.isfinite(array).all() else None

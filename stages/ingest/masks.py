@@ -1,0 +1,158 @@
+"""One soft mask of the person from two segmentations.
+
+The pose model's segmentation knows which body is meant and has limbs and feet, but is blurred; the
+selfie segmentation is sharp about heads and shoulders, but takes in furniture and other people. How
+far the two agree over the clip says how far the second can be trusted. What is known of a background
+that stands still is then taken out, the edge drawn to the picture's edges, and the masks made to agree
+from frame to frame: an avatar cannot score higher than the masks agree with one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from pipeline.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.keypoints import BODY, Keypoints
+from stages.ingest.background import learn, log_odds, take_out
+from stages.ingest.edges import follow_edges
+from stages.ingest.steady import steady
+
+if TYPE_CHECKING:
+    from pipeline.stage import Context
+
+TRUSTED = 0.5  # the selfie mask's share where it agrees with the pose mask
+STRANGE, AGREEING = 0.78, 0.90  # median overlap of the two: share 0, full share
+SHARPEN = 1.5  # contrast of the final mask about one half
+SEED_SCORE = 0.5
+HOLE = 0.004  # smaller ones, of the person's area, are a mistake; the gap under an arm is larger
+
+Pairs = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
+
+
+def write_raw(folder: Path, index: int, body: np.ndarray, selfie: np.ndarray) -> None:
+    """Keep a frame's two segmentations, each [H, W] in [0, 1], as the channels of one picture."""
+    channels = np.stack([body, selfie, np.zeros_like(body)], axis=-1)
+    write_frame(folder, index, np.round(np.clip(channels, 0, 1) * 255).astype(np.uint8))
+
+
+def read_raw(folder: Path, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`write_raw` kept: the pose model's and the selfie segmentation, [H, W] float32."""
+    channels = read_frame(folder, index).astype(np.float32) / 255
+    return channels[..., 0], channels[..., 1]
+
+
+def refine_masks(context: Context, keypoints: Keypoints, raw: Path) -> None:
+    """Turn the two segmentations of each kept frame into one mask in ``output/masks``.
+
+    Args:
+        context: the stage's.
+        keypoints: of the kept frames; its points say which part of a mask is the person.
+        raw: the folder that :func:`write_raw` filled.
+    """
+    settings, output = context.settings, context.output
+    frames = keypoints.frames.tolist()
+    share = selfie_share([overlap(*read_raw(raw, frame)) for frame in frames])
+    context.log(f"masks: pose {1 - share:.2f}, selfie {share:.2f}")
+
+    def fused() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for frame in frames:
+            yield read_frame(output / "frames", frame), fuse(*read_raw(raw, frame), share)
+
+    background = learn(fused()) if settings.background else None
+    model = background.model() if background else None
+
+    def cut() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for row, (image, alpha) in enumerate(fused()):
+            if model is not None:
+                alpha = take_out(alpha, image, model)
+            alpha = fill_holes(main_component(alpha, seeds(keypoints.whole_body[row])))
+            yield image, follow_edges(alpha, image, settings.mask_edge)
+
+    with context.progress(len(frames), "masks") as progress:
+        for frame, alpha in zip(frames, steady(cut(), settings.mask_steadiness), strict=True):
+            sharp = np.clip((alpha - 0.5) * SHARPEN + 0.5, 0, 1)
+            write_mask(output / "masks", frame, np.round(sharp * 255).astype(np.uint8))
+            progress.advance()
+
+
+def copy_masks(context: Context, frames: Sequence[int], raw: Path) -> None:
+    """Publish masks that somebody else made as they are."""
+    for frame in frames:
+        write_mask(context.output / "masks", frame, read_mask(raw, frame))
+
+
+def overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Intersection over union of two masks cut at one half; 0 where both are empty."""
+    union = int(((first > 0.5) | (second > 0.5)).sum())
+    return int(((first > 0.5) & (second > 0.5)).sum()) / union if union else 0.0
+
+
+def selfie_share(overlaps: Sequence[float]) -> float:
+    """The selfie segmentation's share in the clip's masks, from its overlap with the pose model's."""
+    return TRUSTED * float(np.clip((np.median(overlaps) - STRANGE) / (AGREEING - STRANGE), 0, 1))
+
+
+def fuse(body: np.ndarray, selfie: np.ndarray, share: float) -> np.ndarray:
+    """The weighted mean of the two segmentations' log-odds as a mask, [H, W] float32 in [0, 1].
+
+    In log-odds the one that is sure outweighs the one that hesitates.
+    """
+    odds = (1 - share) * log_odds(body) + share * log_odds(selfie)
+    return (1 / (1 + np.exp(-odds))).astype(np.float32)
+
+
+def seeds(points: np.ndarray) -> np.ndarray:
+    """The body points of [133, 3] that surely lie on the person, [N, 2]."""
+    return points[BODY][points[BODY, 2] >= SEED_SCORE, :2]
+
+
+def main_component(alpha: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The mask without the parts that do not hang together with the person.
+
+    Args:
+        alpha: [H, W] in [0, 1].
+        seeds: [N, 2], points on the person in pixels; the component that holds most of them, and all
+            components at least a tenth as large that hold one, are kept. With no seed on any
+            component the largest is kept, and with no component at all the mask stays as it is.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((alpha > 0.5).astype(np.uint8), connectivity=8)
+    if count <= 1:
+        return alpha
+    areas = stats[:, cv2.CC_STAT_AREA].astype(float)
+    areas[0] = 0
+    votes = np.zeros(count)
+    if len(seeds):
+        pixels = np.floor(seeds).astype(int)
+        within = ((pixels >= 0) & (pixels < alpha.shape[::-1])).all(1)
+        votes = np.bincount(labels[pixels[within, 1], pixels[within, 0]], minlength=count).astype(float)
+        votes[0] = 0
+    main = int(np.argmax(votes * areas)) if votes.any() else int(np.argmax(areas))
+    keep = np.flatnonzero((votes > 0) & (areas >= 0.1 * areas[main]))
+    solid = np.isin(labels, [main, *keep]).astype(np.uint8)
+    soft = 2 * max(1, round(0.006 * max(alpha.shape))) + 1
+    wide = cv2.dilate(solid, np.ones((soft, soft), np.uint8)).astype(np.float32)
+    return (alpha * cv2.GaussianBlur(wide, (0, 0), soft / 4)).astype(np.float32)
+
+
+def fill_holes(alpha: np.ndarray) -> np.ndarray:
+    """The mask without small holes, [H, W]: they take the values that surround them.
+
+    Args:
+        alpha: [H, W] in [0, 1].
+    """
+    solid = (alpha > 0.5).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - solid, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] < HOLE * solid.sum()
+    edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    small[0] = False  # the person
+    small[edge] = False
+    if not small.any():
+        return alpha
+    reach = 2 * int(np.sqrt(stats[small, cv2.CC_STAT_AREA].max())) + 3
+    closed = cv2.morphologyEx(alpha, cv2.MORPH_CLOSE, np.ones((reach, reach), np.uint8))
+    return np.where(small[labels], np.maximum(alpha, closed), alpha)

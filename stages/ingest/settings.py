@@ -1,0 +1,52 @@
+"""The settings of the ingest stage."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class IngestSettings:
+    """See the comment of each field; ValueError where a value makes no sense."""
+
+    long_side: int = 512  # pixels; larger footage is stored at this size, smaller footage as it is
+    stride: int = 1  # every stride-th frame is looked at
+    max_frames: int = 0  # how many frames are looked at, 0 for all
+    keypoints: str = "mediapipe"  # or a folder of mmpose/DWPose JSON, one file a frame
+    masks: str = "mediapipe"  # or a folder of grey pictures, one a frame, white where the person is
+    test_fraction: float = 0.1  # the part of the kept frames, at the clip's end, that is held out
+    test_frames: int = 0  # how many of the last frames are held out, in place of test_fraction
+    focal: float = 1.2  # the camera's focal length over the longer side of the picture
+    estimator_long_side: int = 1920  # larger pictures are reduced to this for the estimator
+    estimator_short_side: int = 400  # smaller pictures are enlarged towards this, at most three times
+    body_score: float = 0.3  # a frame whose best body points score less on average holds no person
+    mask_area: float = 0.002  # a frame whose mask covers less of the picture holds no person
+    mask_edge: float = 1.0  # how far the mask follows the picture's own edges, 0 to 1
+    mask_steadiness: int = 2  # frames on either side that a mask is averaged with along the motion
+    background: bool = True  # learn the background where it stands still, and take it out of the masks
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name, (least, most) in RANGES.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ValueError(f"ingest.{name} must lie between {least} and {most}, not {value}")
+        for name in ("keypoints", "masks"):
+            if not getattr(self, name).strip():
+                raise ValueError(f"ingest.{name} must be 'mediapipe' or a folder")
+
+
+RANGES: dict[str, tuple[float, float]] = {
+    "long_side": (32, 8192),
+    "stride": (1, 1_000_000),
+    "max_frames": (0, 10_000_000),
+    "test_fraction": (0, 0.9),
+    "test_frames": (0, 10_000_000),
+    "focal": (0.1, 100),
+    "estimator_long_side": (128, 8192),
+    "estimator_short_side": (32, 8192),
+    "body_score": (0, 1),
+    "mask_area": (0, 1),
+    "mask_edge": (0, 1),
+    "mask_steadiness": (0, 20),
+}
