@@ -67,10 +67,15 @@ DOIT_CONFIG = {
 }
 
 
+def words_of(subject: str) -> dict[str, str]:
+    """The words that concern a subject: footage on the command line is that of the chosen one."""
+    return {name: value for name, value in WORDS.items() if name != "source" or subject in CHOSEN}
+
+
 @functools.cache
 def job_of(subject: str) -> Job:
     """The job of a subject, read when its first task is looked at."""
-    return job_from_words(subject, WORDS)
+    return job_from_words(subject, words_of(subject))
 
 
 def is_current(stage: str, subject: str) -> bool:
@@ -83,7 +88,7 @@ def is_current(stage: str, subject: str) -> bool:
 
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself."""
-    words = [f"{name}={value}" for name, value in WORDS.items() if name != "subject"]
+    words = [f"{name}={value}" for name, value in words_of(subject).items() if name != "subject"]
     command = [sys.executable, "-m", "pipeline.stage", stage, "--subject", subject, *words]
     status = subprocess.run(command, env=process_environment(), check=False).returncode
     if status < 0:
@@ -93,13 +98,15 @@ def run_stage(stage: str, subject: str) -> TaskFailed | None:
     return TaskFailed(f"{stage}:{subject} stopped; its own line above says why") if status else None
 
 
-def source_assets(subject: str) -> list[str]:
-    """The asset that a subject's footage comes in, if any."""
+def needed_assets(stage: str, subject: str) -> list[str]:
+    """The assets that a stage needs under the subject's settings, its footage's included."""
     try:
-        asset = load_subject(WORKSPACE, subject, WORDS.get("source") if subject in CHOSEN else None).asset
+        job = job_of(subject)
     except UserError:
-        return []
-    return [asset] if asset else []
+        return []  # the stage itself reports it
+    demands = STAGES[stage].demands(job.settings[stage])
+    footage = [job.subject.asset] if demands.source and job.subject.asset else []
+    return [*demands.assets, *footage]
 
 
 def remove_versions(stage: str, subject: str) -> None:
@@ -112,14 +119,12 @@ def remove_versions(stage: str, subject: str) -> None:
 
 def stage_task(stage: str, subject: str) -> dict:
     """One stage for one subject."""
-    declared = STAGES[stage]
-    needed = [*declared.assets, *(source_assets(subject) if declared.reads_source else [])]
     return {
         "name": subject,
         "doc": f"{stage} of {subject}",
         "task_dep": [
-            *(f"{upstream}:{subject}" for upstream in declared.needs),
-            *(f"assets:{name}" for name in needed),
+            *(f"{upstream}:{subject}" for upstream in STAGES[stage].needs),
+            *(f"assets:{name}" for name in needed_assets(stage, subject)),
         ],
         "uptodate": [functools.partial(is_current, stage, subject)],
         "actions": [(run_stage, [stage, subject])],

@@ -54,8 +54,7 @@ class Job:
 
     @functools.cached_property
     def source_digest(self) -> str:
-        source = require_footage(self.workspace, self.subject)
-        return digest.of_source(source, self.workspace.artifacts / ".digests.json")
+        return self.digest_of(require_footage(self.workspace, self.subject))
 
     @functools.cached_property
     def body_digest(self) -> str:
@@ -63,7 +62,12 @@ class Job:
             raise UserError(
                 f"{self.workspace.body_file}: there is no body model; leave out body= for the open one"
             )
-        return digest.of_source(self.workspace.body_file, self.workspace.artifacts / ".digests.json")
+        files = [self.workspace.body_file, *sorted(self.workspace.body.glob("landmarks_*.npz"))]
+        return digest.of_json([self.digest_of(file) for file in files])
+
+    def digest_of(self, path: Path) -> str:
+        """The digest of a file or folder outside the store, remembered beside the store."""
+        return digest.of_source(path, self.workspace.artifacts / ".digests.json")
 
     def description(self, name: str, found: Found | None = None) -> dict[str, Any]:
         """What the key of a stage's result is made from; also the head of its manifest.
@@ -75,23 +79,23 @@ class Job:
             UserError: an upstream result is not there, or the footage is not.
         """
         stage = self.stages[name]
-        inputs = {}
+        inputs, who = {}, self.subject.name
         for upstream, patterns in stage.needs.items():
             artifact = self.find(upstream, found)
             if artifact is None:
-                raise UserError(
-                    f"{name} needs {upstream} of '{self.subject.name}': doit run {upstream}:{self.subject.name}"
-                )
+                raise UserError(f"{name} of '{who}' needs {upstream}: doit run {upstream}:{who}")
             inputs[upstream] = {"files": list(patterns), "sha256": artifact.digest_of(patterns)}
-        pins = third_party.load_assets(self.workspace) if stage.assets else {}
+        demands = stage.demands(self.settings[name])
+        pins = third_party.load_assets(self.workspace) if demands.assets else {}
         return {
             "stage": name,
             "version": stage.version,
             "settings": as_dict(self.settings[name]),
             "inputs": inputs,
-            "assets": {asset: pins[asset].identity for asset in stage.assets},
-            "source": self.source_digest if stage.reads_source else None,
-            "body": self.body_digest if stage.reads_body else None,
+            "assets": {asset: pins[asset].identity for asset in demands.assets},
+            "source": self.source_digest if demands.source else None,
+            "body": self.body_digest if demands.body else None,
+            "paths": {setting: self.digest_of(path) for setting, path in demands.paths.items()},
         }
 
     def find(self, name: str, found: Found | None = None) -> Artifact | None:
@@ -228,14 +232,14 @@ def run_stage(job: Job, name: str) -> Artifact:
         if already is not None:
             job.store.select(already)
             return already
-        stage = job.stages[name]
+        stage, demands = job.stages[name], job.stages[name].demands(job.settings[name])
         upstream = {other: job.find(other) for other in stage.needs}
         context = Context(
             subject=subject,
             settings=job.settings[name],
             inputs={other: artifact.folder for other, artifact in upstream.items() if artifact is not None},
-            assets={asset: third_party.require(job.workspace, asset) for asset in stage.assets},
-            source=require_footage(job.workspace, job.subject) if stage.reads_source else None,
+            assets={asset: third_party.require(job.workspace, asset) for asset in demands.assets},
+            source=require_footage(job.workspace, job.subject) if demands.source else None,
             body=job.workspace.body,
             body_file=job.workspace.body_file,
             output=scratch.output,

@@ -16,12 +16,29 @@ import os
 import pkgutil
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.settings import near
+
+
+@dataclasses.dataclass(frozen=True)
+class Demands:
+    """What a stage asks for besides its upstream stages, under the settings of one job.
+
+    Attributes:
+        assets: names in data/assets.toml.
+        source: the footage.
+        body: the body model and its landmarks.
+        paths: the files and folders that settings name, by setting.
+    """
+
+    assets: tuple[str, ...]
+    source: bool
+    body: bool
+    paths: Mapping[str, Path]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +54,11 @@ class Stage:
             digests enter the key, so a change to any other does not make this stage stale.
         assets: the names in data/assets.toml that must be on disk.
         reads_source: whether it reads the footage.
-        reads_body: whether it reads the body model.
+        reads_body: whether it reads the body model and its landmarks.
+        path_settings: the settings that may name a file or a folder, whose content then enters the key.
+
+    ``assets``, ``reads_source`` and ``reads_body`` may be functions of the settings object, so that a
+    stage asks only for what these settings call for.
     """
 
     name: str
@@ -45,9 +66,30 @@ class Stage:
     settings: type
     run: str
     needs: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    assets: tuple[str, ...] = ()
-    reads_source: bool = False
-    reads_body: bool = False
+    assets: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = ()
+    reads_source: bool | Callable[[Any], bool] = False
+    reads_body: bool | Callable[[Any], bool] = False
+    path_settings: tuple[str, ...] = ()
+
+    def demands(self, settings: Any) -> Demands:
+        """What the stage asks for under these settings."""
+
+        def under(value: Any) -> Any:
+            return value(settings) if callable(value) else value
+
+        return Demands(
+            assets=under(self.assets),
+            source=under(self.reads_source),
+            body=under(self.reads_body),
+            paths=self.named_paths(settings),
+        )
+
+    def named_paths(self, settings: Any) -> dict[str, Path]:
+        """The files and folders that settings other than the defaults name."""
+        defaults = {field.name: field.default for field in dataclasses.fields(self.settings)}
+        values = {name: getattr(settings, name) for name in self.path_settings}
+        given = {name: Path(value) for name, value in values.items() if value and value != defaults[name]}
+        return {name: path for name, path in given.items() if path.exists()}
 
 
 def load_stages(package: str = "stages") -> dict[str, Stage]:
@@ -69,7 +111,7 @@ def load_stages(package: str = "stages") -> dict[str, Stage]:
         ]
         if not ready:
             raise UserError(
-                f"{package}: stages that need each other or what does not exist: {sorted(set(found) - set(ordered))}"
+                f"{package}: need each other or what does not exist: {sorted(set(found) - set(ordered))}"
             )
         ordered.update((stage.name, stage) for stage in ready)
     return ordered

@@ -8,7 +8,7 @@ A subject is one file, ``data/subjects/<name>.toml``::
     asset = "smile"                 # footage that assets.toml can fetch ...
     file = "single_face.mp4"
     # path = "sources/oliver.mp4"   # ... or a file or folder of the user's, relative to data/
-    # obtain = "where to get it"
+    # obtain = "where to get it"    (without [source], the ingest settings say what is made up)
     [ingest]                        # any setting of any stage
     test_frames = 30
 
@@ -85,9 +85,9 @@ def parse_subject(
     tables = {name: value for name, value in content.items() if name not in ("title", "dataset", "source")}
     footage = content.get("source", {})
     unknown = set(footage) - {"asset", "file", "path", "obtain"}
-    if unknown or not footage:
+    if unknown:
         raise UserError(
-            f"{path}: [source] needs 'asset' and 'file', or 'path'; found {sorted(footage) or 'none'}"
+            f"{path}: [source] takes 'asset' and 'file', or 'path' and 'obtain', not {sorted(unknown)}"
         )
     layers = [Layer(str(path), tables)]
     if "dataset" in content:
@@ -126,8 +126,8 @@ def require_footage(workspace: Workspace, subject: Subject) -> Path:
         return subject.source
     if subject.asset is not None:
         raise UserError(f"{subject.source}: not fetched yet; fetch it: doit run assets:{subject.asset}")
-    remedy = subject.obtain or "check the path"
+    remedy = (subject.obtain or "name it: source=CLIP.mp4").rstrip(".")
     raise UserError(
-        f"{subject.source}: the footage of '{subject.name}' is not there; {remedy.rstrip('.')}. "
+        f"{subject.source or subject.name}: the footage of '{subject.name}' is not there; {remedy}. "
         "A subject that runs now: doit run subject=smile"
     )

@@ -116,9 +116,7 @@ def pose_body(
     return vertices + transl[..., None, :], posed + transl[..., None, :]
 
 
-def _forward_kinematics(
-    rotation: Tensor, joints: Tensor, parents: tuple[int, ...]
-) -> tuple[Tensor, Tensor]:
+def _forward_kinematics(rotation: Tensor, joints: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """World orientation [T, 55, 3, 3] and position [T, 55, 3] of every joint.
 
     The tree is walked by depth, all joints of a depth at once: 11 steps instead of 55.

@@ -8,6 +8,8 @@ STAGE = Stage(
     version=1,
     settings=IngestSettings,
     run="stages.ingest.run:run",
-    assets=("mediapipe",),
-    reads_source=True,
+    assets=lambda settings: ("mediapipe",) if settings.uses_estimator else (),
+    reads_source=lambda settings: not settings.mannequin,
+    reads_body=lambda settings: bool(settings.mannequin),
+    path_settings=("keypoints", "masks", "mannequin_motion"),
 )

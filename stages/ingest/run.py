@@ -15,6 +15,7 @@ from pipeline.errors import UserError
 from pipeline.keypoints import write_keypoints
 from pipeline.records import Footage, write_cameras, write_footage, write_split
 from stages.ingest.detect import Detected, detect
+from stages.ingest.mannequin.publish import run_mannequin
 from stages.ingest.masks import copy_masks, refine_masks
 from stages.ingest.preview import write_preview
 from stages.ingest.sources import open_sources
@@ -33,6 +34,9 @@ def run(context: Context) -> None:
     Raises:
         UserError: the footage, or what came with it, cannot be used; names the file and the remedy.
     """
+    if context.settings.mannequin:
+        run_mannequin(context)
+        return
     if context.source is None:
         raise UserError(f"subject {context.subject} names no footage: add source=CLIP.mp4 to the command")
     settings, output = context.settings, context.output

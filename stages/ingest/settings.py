@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from stages.ingest.mannequin.spec import spec_of
+
 
 @dataclasses.dataclass(frozen=True)
 class IngestSettings:
@@ -24,6 +26,17 @@ class IngestSettings:
     mask_edge: float = 1.0  # how far the mask follows the picture's own edges, 0 to 1
     mask_steadiness: int = 2  # frames on either side that a mask is averaged with along the motion
     background: bool = True  # learn the background where it stands still, and take it out of the masks
+    mannequin: str = ""  # full, upper or head: film the open body with known truth instead of footage
+    mannequin_motion: str = ""  # names of its motions joined by '+', or a BVH file; empty for what suits
+    mannequin_frames: int = 60  # how many frames are filmed
+    mannequin_size: int = 256  # pixels, both sides of the picture
+    mannequin_fps: float = 25.0  # frames a second
+    mannequin_seed: int = 0  # of the motion, the detector's errors and the picture's grain
+    mannequin_identity: int = 0  # seed of shape, clothes, hair and colours
+    mannequin_noise: float = 1.0  # the detector's error on seen points, 1 for a good detector
+    mannequin_hand_failures: float = 0.03  # the part of frames in which a hand's detection begins to fail
+    mannequin_views: tuple[str, ...] = ()  # unseen cameras that are filmed too: left, right, back, above
+    mannequin_view_stride: int = 10  # every how many frames they are filmed
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -34,6 +47,13 @@ class IngestSettings:
         for name in ("keypoints", "masks"):
             if not getattr(self, name).strip():
                 raise ValueError(f"ingest.{name} must be 'mediapipe' or a folder")
+        if self.mannequin:
+            spec_of(self)
+
+    @property
+    def uses_estimator(self) -> bool:
+        """Whether MediaPipe looks at the footage."""
+        return not self.mannequin and "mediapipe" in (self.keypoints, self.masks)
 
 
 RANGES: dict[str, tuple[float, float]] = {

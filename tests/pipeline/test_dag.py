@@ -214,3 +214,24 @@ def test_prune_keeps_the_version_in_use(toy):
     toy.ran()
     toy.doit("subject=ann", "bend.angle=2")
     assert toy.ran() == []
+
+
+def test_a_file_that_a_setting_names_is_known_by_its_content(toy):
+    extra = toy.root / "extra.txt"
+    extra.write_text("one ")
+    toy.doit("gather:ann", f"gather.extra={extra}")
+    toy.ran()
+    toy.doit("gather:ann", f"gather.extra={extra}")
+    assert toy.ran() == []
+    extra.write_text("two ")
+    toy.doit("gather:ann", f"gather.extra={extra}")
+    assert toy.ran() == ["gather:ann"]
+
+
+def test_a_subject_that_is_made_up_needs_no_footage(toy):
+    toy.subject("doll", 'title = "doll"\n[gather]\nmade_up = "doll "\n')
+    assert toy.doit("subject=doll").returncode == 0
+    assert (toy.store / "doll" / "gather" / "latest" / "text.txt").read_text() == "doll "
+    toy.subject("nothing", 'title = "no footage named"\n')
+    run = toy.doit("subject=nothing")
+    assert run.returncode != 0 and "source=CLIP.mp4" in run.stderr and "Traceback" not in run.stderr

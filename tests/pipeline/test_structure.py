@@ -43,7 +43,8 @@ def test_a_stage_is_declared_by_the_name_of_its_folder():
 
 
 def test_the_dag_loads_nothing_heavy():
-    code = "import sys, dodo; print([name for name in ('torch', 'numpy', 'cv2', 'numba', 'pyarrow') if name in sys.modules])"
+    heavy = ("torch", "numpy", "cv2", "numba", "pyarrow")
+    code = f"import sys, dodo; print([name for name in {heavy} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )

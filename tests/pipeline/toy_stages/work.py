@@ -3,6 +3,7 @@
 import errno
 import os
 import time
+from pathlib import Path
 
 from pipeline.errors import UserError
 
@@ -14,9 +15,11 @@ def note(context):
 
 def gather(context):
     note(context)
-    text = context.source.read_text()
-    (context.output / "text.txt").write_text(text.upper() if context.settings.upper else text)
-    (context.output / "extra.txt").write_text(str(context.settings.unused))
+    settings = context.settings
+    text = settings.made_up or context.source.read_text()
+    text += "" if settings.extra == "none" else Path(settings.extra).read_text()
+    (context.output / "text.txt").write_text(text.upper() if settings.upper else text)
+    (context.output / "extra.txt").write_text(str(settings.unused))
 
 
 def bend(context):
