@@ -1,0 +1,13 @@
+"""fit: the body model registered to the clip's keypoints, wherever there are any (Section 3.1)."""
+
+from pipeline.stage import Stage
+from stages.fit.settings import FitSettings
+
+STAGE = Stage(
+    name="fit",
+    version=1,
+    settings=FitSettings,
+    run="stages.fit.run:run",
+    needs={"ingest": ("keypoints.parquet", "cameras.parquet", "footage.json", "frames/*", "masks/*")},
+    reads_body=True,
+)

@@ -1,0 +1,179 @@
+"""Where the optimisation starts: arms down, the torso turned as the 3D landmarks say, in its place.
+
+A T pose is far from every clip. The torso's turn comes from the estimator's 3D landmarks where the
+torso is seen; the place comes from a weak-perspective fit of the landmarks to their pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+
+from pipeline.body.joints import joint_index
+from pipeline.keypoints import Keypoints
+from stages.fit.observations import POSE_HIPS, POSE_SHOULDERS, Observations
+from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
+from stages.fit.views import Views
+
+ARMS_DOWN = 1.1
+"""Radians about Z by which the shoulders are lowered from the T pose."""
+
+_UNSEEN_DISTANCE = 3.0  # metres before the camera for a body of which nothing is seen
+
+
+def initial_parameters(
+    keypoints: Keypoints, observations: Observations, model: LandmarkModel, views: Views
+) -> Parameters:
+    """The start of the optimisation for T frames.
+
+    Args:
+        keypoints: the clip's detections; only their 3D pose is used here.
+        observations: what the fit aims at.
+        model: the landmarks.
+        views: the cameras.
+    """
+    count = len(observations.frames)
+    rotation = torch.zeros(count, 55, 3)
+    rotation[:, joint_index("left_shoulder"), 2] = -ARMS_DOWN
+    rotation[:, joint_index("right_shoulder"), 2] = ARMS_DOWN
+    rotation[:, 0] = torso_orientation(keypoints, observations, views)
+    sizes = model.shape.shape[2], model.expression.shape[2], model.face.shape[1]
+    parameters = parameters_of(rotation, torch.zeros(count, 3), sizes)
+    points, _ = model.posed(parameters, rotation)
+    transl = weak_perspective(points, observations, views)
+    return parameters_of(rotation, transl, sizes)
+
+
+def torso_orientation(keypoints: Keypoints, observations: Observations, views: Views) -> Tensor:
+    """The pelvis' rotation in the world: [T, 3], rotation vectors, continuous over time.
+
+    Where shoulders and hips are seen they give the whole rotation; where shoulders alone are, they give
+    the turn about the vertical; frames without either take it from their neighbours, and a clip without
+    any faces the camera.
+    """
+    world, score = keypoints.pose_world[..., :3], keypoints.pose_image[..., 3]
+    shoulders = (score[:, POSE_SHOULDERS] >= 0.4).all(1) & np.abs(world).any((1, 2))
+    hips = shoulders & torso_is_seen(observations).numpy()
+    across = world[:, 11] - world[:, 12]
+    up = world[:, POSE_SHOULDERS].mean(1) - world[:, POSE_HIPS].mean(1)
+    across = np.where(hips[:, None], across + world[:, 23] - world[:, 24], across * [1, 0, 1])
+    up = np.where(hips[:, None], up, [0.0, -1.0, 0.0])
+    known = shoulders & (np.linalg.norm(across, axis=1) > 1e-3) & (np.linalg.norm(up, axis=1) > 1e-3)
+    in_camera = np.tile(np.diag([1.0, -1.0, -1.0]), (len(world), 1, 1))  # upright, facing the camera
+    in_camera[known] = _frame(across[known].astype(np.float64), up[known].astype(np.float64))
+    facing = views.rotation.mT.double() @ torch.from_numpy(in_camera)
+    quaternions = _fill(roma.rotmat_to_unitquat(facing), torch.from_numpy(known))
+    return continuous(roma.unitquat_to_rotvec(quaternions)).float()
+
+
+def torso_is_seen(observations: Observations) -> Tensor:
+    """Frames whose hips are no guess: [T] bool. False throughout if the source has no 3D pose."""
+    if observations.limbs.start.numel() == 0:
+        return torch.zeros(len(observations.frames), dtype=torch.bool)
+    return observations.mask[:, list(POSE_HIPS)].any(1)
+
+
+def _frame(across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Rotations whose X axis is nearest to ``across`` for the Y axis ``up``: [T, 3] twice -> [T, 3, 3]."""
+    y = up / np.linalg.norm(up, axis=1, keepdims=True)
+    x = across - (across * y).sum(1, keepdims=True) * y
+    x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    return np.stack([x, y, np.cross(x, y)], axis=2)
+
+
+def _fill(quaternions: Tensor, known: Tensor) -> Tensor:
+    """[T, 4] with the unknown ones interpolated between their neighbours; all unknown are left alone."""
+    rows = torch.nonzero(known)[:, 0]
+    if len(rows) == 0:
+        return quaternions
+    chain = [quaternions[rows[0]]]
+    for row in rows[1:]:
+        following = quaternions[row]
+        chain.append(following if (following * chain[-1]).sum() >= 0 else -following)
+    seen = torch.stack(chain).numpy()
+    every = np.arange(len(quaternions))
+    mixed = np.stack([np.interp(every, rows.numpy(), seen[:, k]) for k in range(4)], axis=1)
+    return torch.from_numpy(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
+
+
+def continuous(rotation: Tensor) -> Tensor:
+    """The same rotations with each vector on the branch nearest to the one before: [T, ..., 3].
+
+    A rotation by angle a about an axis is also one by a - 2 pi, so a turning body's vectors would jump.
+    """
+    flat = rotation.detach().clone().reshape(len(rotation), -1, 3)
+    for t in range(1, len(flat)):
+        before, now = flat[t - 1], flat[t]
+        length = now.norm(dim=-1, keepdim=True)
+        axis = torch.where(length > 1e-6, now / length.clamp_min(1e-6), torch.zeros_like(now))
+        turns = torch.round(((before * axis).sum(-1, keepdim=True) - length) / (2 * math.pi))
+        flat[t] = torch.where(turns != 0, now + 2 * math.pi * turns * axis, now)
+    return flat.reshape(rotation.shape)
+
+
+def weak_perspective(points: Tensor, observations: Observations, views: Views) -> Tensor:
+    """The translation that puts landmarks near their pixels, by linear least squares.
+
+    Each frame has a scale s and a shift: pixel = s * place + shift over its reliable points, which gives
+    depth = focal / s. The scale is held within 0.7 to 1.4 of the clip's median, and frames with fewer than
+    two points are interpolated.
+
+    Args:
+        points: [T, N, 3], posed landmarks without translation, in the world.
+        observations: what was seen.
+        views: the cameras.
+
+    Returns:
+        [T, 3], metres, in the world.
+    """
+    weight = _reliable(observations)[..., None]
+    focal = views.focal.mean(1)
+    place = points @ views.rotation.mT
+    total = weight.sum(1).clamp_min(1e-9)
+    mean_place = (place * weight).sum(1) / total
+    mean_pixel = (observations.pixels * weight).sum(1) / total
+    spread = (place - mean_place[:, None])[..., :2]
+    shift = observations.pixels - mean_pixel[:, None]
+    size = (spread.square() * weight).sum((1, 2))
+    known = (weight[..., 0] > 0).sum(1).ge(2) & (size > 1e-8)
+    if not known.any():
+        ahead = points.new_tensor([0.0, 0.0, _UNSEEN_DISTANCE]).expand(len(points), 3)
+        return _to_world(ahead, views)
+    scale = (spread * shift * weight).sum((1, 2)) / size.clamp_min(1e-8) / focal  # 1 / metres
+    usual = scale[known].clamp_min(1e-3).median()
+    scale = torch.where(known, scale, usual).clamp(usual * 0.7, usual * 1.4)
+    offset = (mean_pixel - views.centre) / views.focal / scale[:, None] - mean_place[:, :2]
+    in_camera = torch.cat([offset, (1 / scale - mean_place[:, 2])[:, None]], dim=1)
+    return _to_world(_interpolated(in_camera, known), views)
+
+
+def _reliable(observations: Observations) -> Tensor:
+    """[T, N] weights of the points that place a body: its torso where seen, else all but the limbs' ends."""
+    weight = observations.mask * observations.weight
+    torso = torso_is_seen(observations)
+    if torso.any():
+        trunk = torch.zeros_like(weight)
+        trunk[:, [*POSE_SHOULDERS, *POSE_HIPS]] = 1.0
+        return torch.where(torso[:, None], trunk * observations.mask, torch.zeros_like(weight))
+    body, face = observations.of("body"), observations.of("face")
+    from_arms = 13 if observations.limbs.start.numel() else 7
+    head = body & (torch.arange(len(body)) < from_arms)
+    steady = head | face
+    return weight * steady if (weight * steady).any() else weight
+
+
+def _interpolated(values: Tensor, known: Tensor) -> Tensor:
+    """[T, K] with the rows that are not known interpolated between those that are."""
+    rows = torch.nonzero(known)[:, 0].numpy()
+    every = np.arange(len(values))
+    columns = [np.interp(every, rows, values[:, k].numpy()[rows]) for k in range(values.shape[1])]
+    return torch.from_numpy(np.stack(columns, axis=1)).to(values.dtype)
+
+
+def _to_world(in_camera: Tensor, views: Views) -> Tensor:
+    """[T, 3] in the camera's axes -> [T, 3] in the world."""
+    return views.to_world(in_camera[:, None])[:, 0]

@@ -1,0 +1,270 @@
+"""What the fit aims at: which points of the body were seen where, and which of them to trust.
+
+The binary mask m_j of Eq. 2 is made here. A point is masked when its score is under tau, when it lies
+outside the picture, or when one of these rules says that it is a guess:
+
+- hips of somebody whose knees are not in the picture;
+- the pose estimator's face where a face mesh was found, and its hand where a hand was found;
+- a hand that ``hands.py`` does not trust.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline import keypoints as coco
+from pipeline.body.landmarks import Landmarks, PointSet, join
+from pipeline.keypoints import Keypoints
+from stages.fit.hands import trusted_hands
+
+GROUPS = ("body", "left_hand", "right_hand", "face")
+"""The groups that residuals are reported by; ``Observations.group`` holds indices into it."""
+
+# MediaPipe's pose: nose, 6 eye points, 2 ears, 2 mouth corners, shoulders, elbows, wrists, 6 points of
+# the hands, hips, knees, ankles, heels, toes.
+POSE_FACE = slice(0, 11)
+POSE_SHOULDERS, POSE_HIPS, POSE_KNEES = (11, 12), (23, 24), (25, 26)
+POSE_OF_HAND = ((15, 17, 19, 21), (16, 18, 20, 22))
+POSE_FINGERS = slice(17, 23)
+LIMBS = (
+    (11, 13), (13, 15), (12, 14), (14, 16), (23, 25), (25, 27), (24, 26), (26, 28), (11, 12), (23, 24),
+)  # fmt: skip
+PALM_BONES = ((0, 5), (0, 17))
+HAND_BONES = PALM_BONES + tuple((a, a + 1) for first in (1, 5, 9, 13, 17) for a in range(first, first + 3))
+
+_BODY_SCALE = 4.0  # there are few body points beside 478 of the face, and each carries a limb
+_MESH_WEIGHT, _FACE68_WEIGHT, _HAND_WEIGHT = 0.3, 1.0, 0.8
+# The palm's direction weighs much: seen in 2D alone, a hand turned the wrong way is a minimum of its own.
+_LIMB_DIRECTION, _PALM_DIRECTION, _FINGER_DIRECTION = 0.7, 10.0, 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Directions:
+    """Where bones point in three dimensions, for L bones.
+
+    Attributes:
+        start, end: [L], indices of observed points.
+        unit: [T, L, 3], unit vectors in the camera's axes.
+        weight: [T, L], how much each counts, 0 where nothing is known.
+    """
+
+    start: Tensor
+    end: Tensor
+    unit: Tensor
+    weight: Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """N points of the body over T frames.
+
+    Attributes:
+        frames: [T], frame numbers of the source clip.
+        points: where the N points lie on the body.
+        group: [N], index into ``GROUPS``.
+        pixels: K, [T, N, 2], pixels.
+        mask: m, [T, N] bool, Eq. 2.
+        weight: [N], how much a seen point counts.
+        limbs, hand_bones: directions in 3D.
+        vague: [N] bool, points that say how head or hand is turned, but nothing of mouth, eyes or fingers.
+        hands: [N] bool, points of wrists and hands.
+        shoulders: the points of the left and the right shoulder.
+    """
+
+    frames: Tensor
+    points: PointSet
+    group: Tensor
+    pixels: Tensor
+    mask: Tensor
+    weight: Tensor
+    limbs: Directions
+    hand_bones: Directions
+    vague: Tensor
+    hands: Tensor
+    shoulders: tuple[int, int]
+
+    def of(self, group: str) -> Tensor:
+        """Which points belong to a group: [N] bool."""
+        return self.group == GROUPS.index(group)
+
+
+def observe(keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray) -> Observations:
+    """Choose the point sets that the estimator gave and mask what cannot be trusted.
+
+    Args:
+        keypoints: the clip's detections.
+        landmarks: where the points lie on the body.
+        threshold: tau, the score under which a point is masked.
+        sizes: [T, 2], width and height of each frame in pixels.
+    """
+    if (keypoints.pose_image[..., 3] > 0).any():
+        return _from_mediapipe(keypoints, landmarks, threshold, sizes)
+    return _from_whole_body(keypoints, landmarks, threshold, sizes)
+
+
+def _from_mediapipe(
+    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray
+) -> Observations:
+    """33 pose points, 2 x 21 hand points and 478 face points."""
+    pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
+    seen_hand = trusted_hands(hands, pose, keypoints.pose_world, threshold)
+    seen_face = (mesh[..., 3] >= threshold).mean(1) > 0.5
+    pose_mask = visible(pose, threshold, sizes)
+    pose_mask[:, POSE_FACE] &= ~seen_face[:, None]
+    drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES)
+    for side, doubles in enumerate(POSE_OF_HAND):
+        pose_mask[:, doubles] &= ~seen_hand[:, side, None]
+    hand_mask = visible(hands, threshold, sizes) & seen_hand[..., None]
+    face_mask = visible(mesh, threshold, sizes) & seen_face[:, None]
+    mask = np.concatenate([pose_mask, hand_mask.reshape(len(mesh), 42), face_mask], axis=1)
+    pixels = np.concatenate([pose[..., :2], hands.reshape(len(mesh), 42, 4)[..., :2], mesh[..., :2]], axis=1)
+    group = np.repeat([0, 1, 2, 3], [33, 21, 21, 478])
+    weight = np.concatenate([_pose_weights(), np.full(42, _HAND_WEIGHT), np.full(478, _MESH_WEIGHT)])
+    world = keypoints.pose_world
+    limbs = _directions(world[..., :3], LIMBS, 0, _both(world[..., 3] >= threshold, LIMBS))
+    limbs.weight.mul_(_LIMB_DIRECTION)
+    limbs.weight[:, _limbs_of_hips()] *= torch.from_numpy(pose_mask[:, POSE_HIPS].any(1)).float()[:, None]
+    return _assemble(
+        keypoints,
+        join(landmarks.pose, landmarks.hands, landmarks.face_mesh),
+        (group, pixels, mask, weight),
+        (limbs, _hand_directions(hands, hand_mask)),
+        vague=np.r_[POSE_FACE, POSE_FINGERS],
+        hands=np.r_[15:23, 33:75],
+        shoulders=POSE_SHOULDERS,
+    )
+
+
+def _from_whole_body(
+    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray
+) -> Observations:
+    """The 133 points of COCO-WholeBody, which have no depth."""
+    points = keypoints.whole_body
+    mask = visible(points, threshold, sizes)
+    seen_face = mask[:, coco.FACE].mean(1) > 0.5
+    mask[:, coco.FACE] &= seen_face[:, None]
+    mask[:, :5] &= ~seen_face[:, None]
+    drop_guesses(mask, (11, 12), (13, 14))
+    for hand, wrist in ((coco.LEFT_HAND, 9), (coco.RIGHT_HAND, 10)):
+        seen_hand = mask[:, hand].mean(1) > 0.5
+        mask[:, hand] &= seen_hand[:, None]
+        mask[:, wrist] &= ~seen_hand
+    group = np.repeat([0, 3, 1, 2], [23, 68, 21, 21])
+    body = np.ones(23)
+    body[1:3], body[5:11], body[11:13] = 0.3, 1.5, 0.5
+    weight = np.concatenate([_BODY_SCALE * body, np.full(68, _FACE68_WEIGHT), np.full(42, _HAND_WEIGHT)])
+    nothing = _directions(points, (), 0, np.zeros((len(points), 0), bool))
+    return _assemble(
+        keypoints,
+        landmarks.whole_body,
+        (group, points[..., :2], mask, weight),
+        (nothing, nothing),
+        vague=np.r_[0:5],
+        hands=np.r_[9:11, coco.LEFT_HAND, coco.RIGHT_HAND],
+        shoulders=(5, 6),
+    )
+
+
+def _assemble(
+    keypoints: Keypoints,
+    points: PointSet,
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    directions: tuple[Directions, Directions],
+    vague: np.ndarray,
+    hands: np.ndarray,
+    shoulders: tuple[int, int],
+) -> Observations:
+    """From the group, pixels, mask and weight of N points; ``vague`` and ``hands`` are indices."""
+    group, pixels, mask, weight = arrays
+    rows = np.arange(len(group))
+    return Observations(
+        frames=torch.from_numpy(keypoints.frames.astype(np.int64)),
+        points=points,
+        group=torch.from_numpy(group),
+        pixels=torch.from_numpy(np.where(mask[..., None], pixels, 0).astype(np.float32)),
+        mask=torch.from_numpy(mask),
+        weight=torch.from_numpy(weight.astype(np.float32)),
+        limbs=directions[0],
+        hand_bones=directions[1],
+        vague=torch.from_numpy(np.isin(rows, vague)),
+        hands=torch.from_numpy(np.isin(rows, hands)),
+        shoulders=shoulders,
+    )
+
+
+def visible(points: np.ndarray, threshold: float, sizes: np.ndarray) -> np.ndarray:
+    """Which points are scored at least ``threshold``, finite, and inside the picture.
+
+    Args:
+        points: [T, ..., C], x and y first, the score last.
+        threshold: tau.
+        sizes: [T, 2], width and height.
+    """
+    limit = sizes.reshape(len(points), *[1] * (points.ndim - 2), 2)
+    with np.errstate(invalid="ignore"):
+        inside = ((points[..., :2] > 0) & (points[..., :2] < limit)).all(-1)
+        return inside & (points[..., -1] >= threshold) & (points[..., -1] > 0) & np.isfinite(points).all(-1)
+
+
+def drop_guesses(
+    mask: np.ndarray, doubtful: tuple[int, int], witness: tuple[int, int], reach: int = 12
+) -> None:
+    """Mask the doubtful points (in place) where, within ``reach`` frames, a witness is seen in under 20%.
+
+    The hips of a seated or cropped person score well and are guesses.
+    """
+    seen = mask[:, witness].any(1).astype(np.float64)
+    window = np.ones(2 * reach + 1)
+    frames = np.convolve(np.ones_like(seen), window, "full")[reach:-reach]
+    share = np.convolve(seen, window, "full")[reach:-reach] / frames
+    mask[:, doubtful] &= (share >= 0.2)[:, None]
+
+
+def _pose_weights() -> np.ndarray:
+    """How much each of the 33 pose points counts: joints most, the vague points of face and hand least."""
+    weight = np.ones(33)
+    weight[[1, 2, 3, 4, 5, 6, 9, 10]] = 0.3
+    weight[11:17] = 1.5
+    weight[POSE_FINGERS] = 0.3
+    weight[23:25] = 0.5
+    return _BODY_SCALE * weight
+
+
+def _directions(
+    places: np.ndarray, bones: tuple[tuple[int, int], ...], offset: int, known: np.ndarray
+) -> Directions:
+    """Unit vectors along bones: places [T, K, 3], known [T, L]; ``offset`` is the first place's index."""
+    pairs = np.array(bones, np.int64).reshape(-1, 2)
+    vector = np.nan_to_num(places[:, pairs[:, 1]] - places[:, pairs[:, 0]])
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    known = known & (length[..., 0] > 1e-6)
+    return Directions(
+        start=torch.from_numpy(pairs[:, 0] + offset),
+        end=torch.from_numpy(pairs[:, 1] + offset),
+        unit=torch.from_numpy((vector / np.maximum(length, 1e-6)).astype(np.float32)),
+        weight=torch.from_numpy(known.astype(np.float32)),
+    )
+
+
+def _hand_directions(hands: np.ndarray, mask: np.ndarray) -> Directions:
+    known = [_both(mask[:, side], HAND_BONES) for side in (0, 1)]
+    parts = [_directions(hands[:, s, :, :3], HAND_BONES, 33 + 21 * s, known[s]) for s in (0, 1)]
+    for part in parts:
+        part.weight[:, : len(PALM_BONES)] *= _PALM_DIRECTION
+        part.weight[:, len(PALM_BONES) :] *= _FINGER_DIRECTION
+    both = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(Directions)}
+    return Directions(*(torch.cat(values, dim=0 if values[0].ndim == 1 else 1) for values in both.values()))
+
+
+def _both(mask: np.ndarray, bones: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """[T, K] -> [T, L]: whether both ends of each bone are seen."""
+    pairs = np.array(bones, np.int64)
+    return mask[:, pairs[:, 0]] & mask[:, pairs[:, 1]]
+
+
+def _limbs_of_hips() -> list[int]:
+    return [row for row, (a, b) in enumerate(LIMBS) if a in POSE_HIPS or b in POSE_HIPS]

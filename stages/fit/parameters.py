@@ -1,0 +1,186 @@
+"""What is optimised, and the landmarks that it poses.
+
+Only the landmarks are posed, not the mesh. Every landmark is a point with skinning weights: a joint is
+a point that moves rigidly with it, and a point on the surface mixes rest position and weights of its
+triangle's corners. (Posing the corners and mixing afterwards differs by under a tenth of a millimetre
+on triangles of this size.) So all of them are one small skinning, linear in shape, expression and
+offsets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from pipeline.body import BodyModel, joint_transforms, mean_identity, rest_joints, skin
+from pipeline.body.joints import BODY_POSE, GLOBAL_ORIENT, JAW
+from pipeline.body.landmarks import PointSet
+
+EYES, HANDS = slice(23, 25), slice(25, 55)
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """The unknowns of a clip of T frames: leaves of the optimisation.
+
+    Attributes:
+        global_orient: [T, 1, 3], radians, as are the next four.
+        body_pose: [T, 21, 3].
+        jaw: [T, 1, 3].
+        eyes: [T, 2, 3].
+        hands: [T, 30, 3].
+        expression: psi, [T, E].
+        transl: [T, 3], metres.
+        betas: beta, [B].
+        joint_offset: Delta J, [55, 3], metres.
+        face_control: [C, 3], metres; spread over the face it is Delta V_face.
+    """
+
+    global_orient: Tensor
+    body_pose: Tensor
+    jaw: Tensor
+    eyes: Tensor
+    hands: Tensor
+    expression: Tensor
+    transl: Tensor
+    betas: Tensor
+    joint_offset: Tensor
+    face_control: Tensor
+
+    @property
+    def rotation(self) -> Tensor:
+        """Theta, [T, 55, 3], rotation vectors in the order of the schema."""
+        return torch.cat([self.global_orient, self.body_pose, self.jaw, self.eyes, self.hands], dim=1)
+
+    def named(self) -> dict[str, Tensor]:
+        """Every tensor by its name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def zeros(self) -> Parameters:
+        """Zeros of the same shapes."""
+        return Parameters(**{name: torch.zeros_like(value) for name, value in self.named().items()})
+
+    def leaves(self) -> Parameters:
+        """Copies that an optimiser can change."""
+        copies = self.detached().named()
+        return Parameters(**{name: value.requires_grad_() for name, value in copies.items()})
+
+    def detached(self) -> Parameters:
+        """Copies of the values alone."""
+        return Parameters(**{name: value.detach().clone() for name, value in self.named().items()})
+
+
+def parameters_of(rotation: Tensor, transl: Tensor, sizes: tuple[int, int, int]) -> Parameters:
+    """Parameters with a pose and a place, everything else zero.
+
+    Args:
+        rotation: [T, 55, 3].
+        transl: [T, 3].
+        sizes: the numbers of betas, expressions and face controls.
+    """
+    betas, expressions, controls = sizes
+    new = rotation.new_zeros
+    return Parameters(
+        rotation[:, GLOBAL_ORIENT], rotation[:, BODY_POSE], rotation[:, JAW : JAW + 1], rotation[:, EYES],
+        rotation[:, HANDS], new(len(rotation), expressions), transl, new(betas), new(55, 3), new(controls, 3),
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class LandmarkModel:
+    """N landmarks of a body as points to be skinned.
+
+    Attributes:
+        rest: [N, 3], metres, T pose.
+        shape: [N, 3, B]; expression: [N, 3, E].
+        weights: [N, 55], skinning.
+        joint: [N, 55], 1 where the landmark is that joint.
+        face: [N, C], how far each face control moves each landmark.
+        joints: [55, 3], rest joints; joint_shape: [55, 3, B].
+        parents: the kinematic tree.
+    """
+
+    rest: Tensor
+    shape: Tensor
+    expression: Tensor
+    weights: Tensor
+    joint: Tensor
+    face: Tensor
+    joints: Tensor
+    joint_shape: Tensor
+    parents: tuple[int, ...]
+
+    def posed(self, parameters: Parameters, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Landmarks [T, N, 3] and joints [T, 55, 3] in the world, metres."""
+        rest = self.rest + self.shape @ parameters.betas + self.joint @ parameters.joint_offset
+        rest = rest + self.face @ parameters.face_control
+        flat = self.expression.flatten(0, 1)
+        points = rest + (parameters.expression @ flat.mT).unflatten(1, self.rest.shape)
+        joints = self.joints + self.joint_shape @ parameters.betas + parameters.joint_offset
+        transforms = joint_transforms(rotation, joints, self.parents)
+        place = parameters.transl[:, None]
+        moved = (transforms[..., :3] @ joints[..., None])[..., 0] + transforms[..., 3]
+        return skin(transforms, self.weights, points) + place, moved + place
+
+
+def landmark_model(body: BodyModel, points: PointSet, betas: int, spread: Tensor) -> LandmarkModel:
+    """The landmarks of a body.
+
+    Args:
+        body: the body.
+        points: N landmarks.
+        betas: B, how many shape coefficients are used.
+        spread: [V, C], Delta V_face at each vertex for each face control.
+    """
+    on_joint = points.joint >= 0
+    joint = one_hot(points.joint.clamp_min(0), len(body.parents)).float() * on_joint[:, None]
+    share = points.barycentrics * ~on_joint[:, None]
+    joints = rest_joints(body, mean_identity(body))
+    shape = body.shape_directions[..., :betas]
+    joint_shape = torch.einsum("jv,vck->jck", body.joint_regressor, shape)
+
+    def mixed(attribute: Tensor) -> Tensor:  # [V, ...] -> [N, ...]
+        return torch.einsum("nk,nk...->n...", share, attribute[points.vertices])
+
+    return LandmarkModel(
+        rest=mixed(body.v_template) + joint @ joints,
+        shape=mixed(shape) + torch.einsum("nj,jck->nck", joint, joint_shape),
+        expression=mixed(body.expression_directions),
+        weights=mixed(body.skinning_weights) + joint,
+        joint=joint,
+        face=mixed(spread),
+        joints=joints,
+        joint_shape=joint_shape,
+        parents=body.parents,
+    )
+
+
+def movable_joints(model: LandmarkModel, seen: Tensor, vague: Tensor) -> Tensor:
+    """The joints whose rotation some seen landmark depends on: [55] bool.
+
+    What no landmark depends on stays where it was initialised: a hand that is never seen never moves.
+
+    Args:
+        model: N landmarks.
+        seen: [N] bool, seen in any frame.
+        vague: [N] bool, landmarks that turn head and wrist but move no jaw, eye or finger.
+    """
+    moved = _moved_by(model, seen)
+    moved[JAW:] = _moved_by(model, seen & ~vague)[JAW:]
+    return moved
+
+
+def _moved_by(model: LandmarkModel, chosen: Tensor) -> Tensor:
+    """The joints that move any of the chosen landmarks: [55] bool."""
+    moved = torch.zeros(len(model.parents), dtype=torch.bool)
+    for weights, is_joint in zip(model.weights[chosen], model.joint[chosen].any(1).tolist(), strict=True):
+        for joint in torch.nonzero(weights > 1e-4)[:, 0].tolist():
+            # A joint's own rotation does not move the joint.
+            above = model.parents[joint] if is_joint else joint
+            while above >= 0 and not moved[above]:
+                moved[above] = True
+                above = model.parents[above]
+    return moved

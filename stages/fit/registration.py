@@ -1,0 +1,107 @@
+"""Masked registration of the body to a clip (Section 3.1), from detections to identity and poses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.body import BodyModel, Identity, Landmarks, Poses
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.keypoints import Keypoints
+from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initialise import continuous, initial_parameters
+from stages.fit.objective import Objective
+from stages.fit.observations import Observations, observe
+from stages.fit.optimise import optimise
+from stages.fit.parameters import landmark_model, movable_joints
+from stages.fit.settings import FitSettings
+from stages.fit.views import Views, stack
+
+
+@dataclasses.dataclass(frozen=True)
+class Registration:
+    """A fitted clip.
+
+    Attributes:
+        identity: beta, Delta J, Delta V_face.
+        poses: theta, psi and translation of every frame.
+        observations: what was fitted to.
+        error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
+    """
+
+    identity: Identity
+    poses: Poses
+    observations: Observations
+    error: Tensor
+
+
+def register(
+    body: BodyModel,
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    cameras: Mapping[int, Camera],
+    settings: FitSettings,
+    report: Callable[[str], None] = lambda note: None,
+) -> Registration:
+    """Fit the body to a clip.
+
+    Args:
+        body: the body.
+        landmarks: where keypoints lie on it.
+        keypoints: detections of T frames.
+        cameras: frame number -> camera.
+        settings: the stage's.
+        report: called after each step with a note on the loss.
+
+    Raises:
+        UserError: a frame has no camera, or there are no frames.
+    """
+    views = views_of(keypoints, cameras)
+    observations = observe(keypoints, landmarks, settings.score_threshold, views.size.numpy())
+    seen = observations.mask.any(0)
+    on_face = observations.of("face") & on_skin(body, observations.points)
+    spread = spread_matrix(body, observations.points[on_face])
+    betas = min(settings.betas, body.shape_directions.shape[2])
+    model = landmark_model(body, observations.points, betas, spread)
+    initial = initial_parameters(keypoints, observations, model, views)
+    movable = movable_joints(model, seen, observations.vague)
+    objective = Objective(body, observations, model, views, initial, movable, settings)
+    frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
+    fitted = optimise(objective, initial, settings.iterations, frozen, settings.learning_rate, report)
+    with torch.no_grad():
+        rotation = continuous(objective.predict(fitted).rotation)
+        identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
+    poses = Poses(tuple(keypoints.frames.tolist()), rotation, fitted.expression, fitted.transl)
+    return Registration(identity, poses, observations, objective.residuals(fitted))
+
+
+def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:
+    """The groups of parameters that are not fitted: unseen, or switched off."""
+    frozen = set()
+    if not settings.joint_offsets:
+        frozen.add("joint_offset")
+    if not settings.face_offsets or not face_is_seen:
+        frozen.add("face_control")
+    if not face_is_seen:
+        frozen.add("expression")
+    return frozenset(frozen)
+
+
+def views_of(keypoints: Keypoints, cameras: Mapping[int, Camera]) -> Views:
+    """The cameras of the frames that have keypoints.
+
+    Raises:
+        UserError: there are no frames, or one has no camera.
+    """
+    remedy = "run the ingest stage again"
+    if len(keypoints.frames) == 0:
+        raise UserError(f"keypoints.parquet holds no frame: {remedy}")
+    missing = np.setdiff1d(keypoints.frames, np.array(sorted(cameras), np.int64))
+    if len(missing):
+        raise UserError(f"cameras.parquet has no camera for frame {missing[0]}: {remedy}")
+    return stack([cameras[frame] for frame in keypoints.frames.tolist()])

@@ -1,0 +1,91 @@
+"""The fit stage: keypoints in, identity and poses out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from pipeline.body import (
+    BodyModel,
+    Identity,
+    load_body,
+    load_landmarks,
+    rest_vertices,
+    write_identity,
+    write_poses,
+)
+from pipeline.camera import Camera
+from pipeline.frames import write_png, write_video
+from pipeline.keypoints import read_keypoints
+from pipeline.records import read_cameras, read_footage
+from pipeline.stage import Context
+from stages.fit.optimise import one_thread
+from stages.fit.overlay import overlays, sheet, sheet_rows
+from stages.fit.registration import Registration, register
+from stages.fit.residuals import group_means, write_residuals
+
+_FPS = 25.0  # of the overlay, where the footage has no clock
+
+
+def run(context: Context) -> None:
+    """Fit a clip and publish identity, poses, template, residuals and overlays."""
+    with one_thread():
+        _run(context)
+
+
+def _run(context: Context) -> None:
+    ingest = context.inputs["ingest"]
+    body = load_body(context.body_file)
+    landmarks = load_landmarks(body, context.body)
+    keypoints = read_keypoints(ingest / "keypoints.parquet")
+    cameras = read_cameras(ingest / "cameras.parquet")
+    start = time.monotonic()
+    with context.progress(context.settings.iterations, "registration") as progress:
+        fitted = register(
+            body, landmarks, keypoints, cameras, context.settings, lambda note: progress.advance(1, note)
+        )
+    context.timing("registration_seconds", round(time.monotonic() - start, 2))
+    means = group_means(fitted.error, fitted.observations)
+    summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
+    context.log(f"reprojection: {summary or 'no keypoint was trusted in any frame'}")
+    write_identity(context.output / "identity.safetensors", fitted.identity, body)
+    write_poses(context.output / "poses.parquet", fitted.poses)
+    write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
+    write_template(context.output / "template.ply", body, fitted.identity)
+    start = time.monotonic()
+    write_overlays(context, body, fitted, cameras)
+    context.timing("overlay_seconds", round(time.monotonic() - start, 2))
+
+
+def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
+    """Write the identity's mesh in T pose as binary PLY, metres."""
+    with torch.no_grad():
+        vertices = rest_vertices(body, identity).numpy()
+    mesh = trimesh.Trimesh(vertices, body.faces.numpy(), process=False)
+    path.write_bytes(trimesh.exchange.ply.export_ply(mesh, vertex_normal=False))
+
+
+def write_overlays(
+    context: Context, body: BodyModel, fitted: Registration, cameras: Mapping[int, Camera]
+) -> None:
+    """Write ``overlay.mp4``, every frame, and ``overlay.png``, a contact sheet."""
+    ingest, poses = context.inputs["ingest"], fitted.poses
+    wanted, kept = sheet_rows(len(poses)), {}
+    opacity = context.settings.overlay_opacity
+
+    def drawing() -> Iterator[np.ndarray]:
+        pictures = overlays(body, fitted.identity, poses, cameras, ingest / "frames", opacity)
+        with context.progress(len(poses), "overlay") as progress:
+            for row, picture in enumerate(pictures):
+                if row in wanted:
+                    kept[row] = picture
+                yield picture
+                progress.advance()
+
+    write_video(context.output / "overlay.mp4", drawing(), read_footage(ingest / "footage.json").fps or _FPS)
+    write_png(context.output / "overlay.png", sheet(ingest / "frames", ingest / "masks", poses, kept))

@@ -1,0 +1,153 @@
+"""The terms of the registration objective (Section 3.1), each a pure function of tensors.
+
+They return unreduced values; ``objective.py`` weights and sums them. Terms that the paper names carry
+its symbol and equation number. Where the paper takes an L1 norm of parameters this version squares
+them: a body part that is hardly seen then returns to its prior without being pinned to it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def keypoint_loss(
+    projected: Tensor,  # [T, N, 2]
+    target: Tensor,  # [T, N, 2]
+    mask: Tensor,  # [T, N]
+    saturation: Tensor | None = None,  # [N]
+) -> Tensor:
+    """L_kpt, Eq. 2: masked reprojection error m_j |Pi(V_j) - K_j|, in pixels.
+
+    The norm is sqrt(|e|^2 + 1) - 1, which is differentiable where a point is hit exactly.
+
+    Args:
+        projected: where the points are seen in the model, pixels.
+        target: K, where they were detected, pixels.
+        mask: m, 0 or 1.
+        saturation: the error in pixels that the loss of a point tends to, e s / (e + s), so that a
+            wrong detection pulls no harder the farther it is; None leaves it linear.
+
+    Returns:
+        [T, N], pixels, 0 where masked.
+    """
+    error = torch.sqrt((projected - target).square().sum(-1) + 1) - 1
+    if saturation is not None:
+        error = error * saturation / (error + saturation)
+    return torch.where(mask > 0, error, torch.zeros_like(error))
+
+
+def initial_loss(value: Tensor, initial: Tensor) -> Tensor:
+    """L_init, Eq. 3, for one of theta, beta and psi: squared departure from the initial value."""
+    return (value - initial).square()
+
+
+def shape_loss(betas: Tensor) -> Tensor:
+    """L_shape in Eq. 5: beta^2, [B]."""
+    return betas.square()
+
+
+def joint_offset_loss(joint_offset: Tensor) -> Tensor:
+    """L_jo in Eq. 5: squared length of Delta J, [55, 3] -> [55], square metres."""
+    return joint_offset.square().sum(-1)
+
+
+def symmetry_loss(offset: Tensor, mirror: Tensor) -> Tensor:
+    """L_sym in Eq. 5: squared difference between offsets of the left and the mirrored right.
+
+    Args:
+        offset: [N, 3], metres, X to the subject's left.
+        mirror: [N, N], a row picks (or mixes) the points opposite to a point.
+
+    Returns:
+        [N], square metres.
+    """
+    opposite = (mirror @ offset) * offset.new_tensor([-1.0, 1.0, 1.0])
+    return (offset - opposite).square().sum(-1)
+
+
+def face_offset_loss(face_offset: Tensor) -> Tensor:
+    """Squared length of Delta V_face at some points, [N, 3] -> [N], square metres."""
+    return face_offset.square().sum(-1)
+
+
+def direction_loss(start: Tensor, end: Tensor, unit: Tensor) -> Tensor:
+    """1 - cos of the angle between bones and their detected directions.
+
+    Args:
+        start, end: [T, L, 3], the bones' ends.
+        unit: [T, L, 3], unit vectors in the same axes.
+
+    Returns:
+        [T, L], 0 where they agree, 2 where they are opposite.
+    """
+    return 1 - (functional.normalize(end - start, dim=-1, eps=1e-6) * unit).sum(-1)
+
+
+def in_front_loss(depth: Tensor, chest: Tensor, distance: float) -> Tensor:
+    """How much points seen before the chest lie nearer to it than ``distance``, squared.
+
+    With one camera the depth of a hand is free, and hands sink into the torso.
+
+    Args:
+        depth: [T, N], metres along the camera's axis.
+        chest: [T], metres, the depth of the shoulders.
+        distance: metres.
+
+    Returns:
+        [T, N], square metres.
+    """
+    return (depth - (chest[:, None] - distance)).clamp_min(0).square()
+
+
+def range_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """How far angles lie outside what a joint can do, squared.
+
+    Args:
+        angle: [..., K], radians.
+        low, high: [K], radians.
+
+    Returns:
+        [..., K], square radians, 0 within the range.
+    """
+    return (low - angle).clamp_min(0).square() + (angle - high).clamp_min(0).square()
+
+
+def velocity(values: Tensor, times: Tensor) -> Tensor:
+    """Change a frame between neighbours, times the square root of their distance.
+
+    Its square summed over a gap of dropped frames is what the same motion, spread evenly over the
+    missing frames, would have given.
+
+    Args:
+        values: [T, ...].
+        times: [T], increasing, in frames.
+
+    Returns:
+        [T - 1, ...]; empty for one frame.
+    """
+    gap = _like(times.diff(), values)
+    return values.diff(dim=0) / gap.sqrt()
+
+
+def acceleration(values: Tensor, times: Tensor) -> Tensor:
+    """Second difference a frame squared; x[t+1] - 2 x[t] + x[t-1] where no frame is missing.
+
+    Args:
+        values: [T, ...].
+        times: [T], increasing, in frames.
+
+    Returns:
+        [T - 2, ...]; empty for fewer than three frames.
+    """
+    if len(values) < 3:
+        return values[:0]
+    gap = _like(times.diff(), values)
+    rate = values.diff(dim=0) / gap
+    return rate.diff(dim=0) * 2 / (gap[1:] + gap[:-1])
+
+
+def _like(gap: Tensor, values: Tensor) -> Tensor:
+    """[T - 1] -> [T - 1, 1, ...] of the values' dtype."""
+    return gap.to(values.dtype).reshape(-1, *[1] * (values.dim() - 1))

@@ -1,0 +1,95 @@
+"""A clip whose truth is known: the open body moving before a camera, its landmarks as detections."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipeline.body import (
+    Landmarks,
+    Poses,
+    joint_index,
+    load_body,
+    load_landmarks,
+    locate,
+    mean_identity,
+    pose_body,
+)
+from pipeline.camera import Camera, facing_camera, project
+from pipeline.keypoints import Keypoints, empty_keypoints
+from stages.fit.settings import FitSettings
+
+BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
+BODY_FILE = BODY_FOLDER / "open_body.npz"
+SIZE = 256
+QUICK = FitSettings(iterations=100)
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """Detections, and the poses and joints [T, 55, 3] behind them."""
+
+    keypoints: Keypoints
+    cameras: dict[int, Camera]
+    poses: Poses
+    joints: torch.Tensor
+
+
+def load():
+    body = load_body(BODY_FILE)
+    return body, load_landmarks(body, BODY_FOLDER)
+
+
+def true_poses(frames: tuple[int, ...], distance: float = 3.0) -> Poses:
+    """Somebody standing, turned a little, who lifts the left forearm while walking to the side."""
+    count = len(frames)
+    phase = torch.linspace(0, 1, count)
+    rotation = torch.zeros(count, 55, 3)
+    rotation[:, 0, 1] = 0.3 + 0.2 * phase
+    rotation[:, joint_index("left_shoulder"), 2] = -1.0
+    rotation[:, joint_index("right_shoulder"), 2] = 1.2
+    rotation[:, joint_index("left_elbow"), 1] = -0.6 - 0.6 * phase
+    rotation[:, joint_index("head"), 1] = 0.3 * phase
+    rotation[:, joint_index("left_knee"), 0] = 0.4
+    transl = torch.stack([0.1 * phase, 0.2 + 0 * phase, -distance + 0 * phase], dim=1)
+    return Poses(frames, rotation, torch.zeros(count, 1), transl)
+
+
+def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> Clip:
+    """The clip; the hands are never detected, the face only if asked for."""
+    frames = tuple(range(3, 3 + gap * count, gap))
+    poses = true_poses(frames)
+    camera = facing_camera(SIZE, SIZE, 1.2 * SIZE)
+    vertices, joints = pose_body(body, mean_identity(body), poses.rotation, poses.expression, poses.transl)
+
+    def seen(points):  # -> [T, K, 4], pixels and score
+        pixels = project(camera, locate(points, joints, vertices))
+        return torch.cat(
+            [pixels, torch.zeros_like(pixels[..., :1]), torch.ones_like(pixels[..., :1])], -1
+        ).numpy()
+
+    world = locate(landmarks.pose, joints, vertices)
+    world = (world - world[:, 23:25].mean(1, keepdim=True)) * torch.tensor([1.0, -1.0, -1.0])
+    blank = empty_keypoints(np.array(frames))
+    keypoints = dataclasses.replace(
+        blank,
+        pose_image=seen(landmarks.pose),
+        pose_world=np.concatenate([world.numpy(), np.ones((count, 33, 1), np.float32)], -1),
+        face_mesh=seen(landmarks.face_mesh) if face else blank.face_mesh,
+    )
+    return Clip(keypoints, dict.fromkeys(frames, camera), poses, joints)
+
+
+def whole_body(clip: Clip, body, landmarks: Landmarks) -> Clip:
+    """The same clip as the 133 points alone, as an mmpose file gives them."""
+    vertices, joints = pose_body(
+        body, mean_identity(body), clip.poses.rotation, clip.poses.expression, clip.poses.transl
+    )
+    camera = next(iter(clip.cameras.values()))
+    pixels = project(camera, locate(landmarks.whole_body, joints, vertices))
+    blank = empty_keypoints(clip.keypoints.frames)
+    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1).numpy()
+    return dataclasses.replace(clip, keypoints=dataclasses.replace(blank, whole_body=points))

@@ -1,0 +1,222 @@
+"""Registration on clips whose truth is known, and the stage's files."""
+
+import contextlib
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+import trimesh
+
+from pipeline.body import joint_index, pose_body, read_identity, read_poses, rest_vertices
+from pipeline.errors import UserError
+from pipeline.frames import write_frame, write_mask
+from pipeline.keypoints import write_keypoints
+from pipeline.records import Footage, write_cameras, write_footage
+from stages.fit.registration import register
+from stages.fit.run import run
+from stages.fit.settings import FitSettings
+from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER, QUICK, SIZE, load, make_clip, whole_body
+
+LEFT_ARM = ("left_shoulder", "left_elbow", "left_wrist")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load()
+
+
+@pytest.fixture(scope="module")
+def clip(model):
+    return make_clip(*model)
+
+
+@pytest.fixture(scope="module")
+def masked(clip):
+    """The right arm is never seen, and in one frame nothing is."""
+    pose = clip.keypoints.pose_image.copy()
+    pose[:, [14, 16, 18, 20, 22], 3] = 0.1
+    pose[3, :, 3] = 0.1
+    world = clip.keypoints.pose_world.copy()
+    world[..., 3] = pose[..., 3]
+    keypoints = dataclasses.replace(clip.keypoints, pose_image=pose, pose_world=world)
+    return dataclasses.replace(clip, keypoints=keypoints)
+
+
+@pytest.fixture(scope="module")
+def fitted(model, masked):
+    return register(*model, masked.keypoints, masked.cameras, QUICK)
+
+
+def joints_of(model, registration):
+    poses = registration.poses
+    return pose_body(model[0], registration.identity, poses.rotation, poses.expression, poses.transl)[1]
+
+
+def test_known_pose_is_recovered(model, masked, fitted):
+    assert fitted.error[~fitted.error.isnan()].mean() < 1.0  # pixels; the person is some 200 tall
+    names = (*LEFT_ARM, "head", "left_hip", "right_hip", "left_knee", "right_ankle")
+    rows = [joint_index(name) for name in names]
+    away = joints_of(model, fitted)[:, rows] - masked.joints[:, rows]
+    across = away[[0, 1, 2, 4, 5]][..., :2].norm(dim=-1)
+    assert across.mean() < 0.03
+    assert across.max() < 0.10
+
+
+def test_never_seen_hands_and_arm_stay_where_they_started(fitted):
+    rotation = fitted.poses.rotation
+    assert (rotation[:, 25:] == 0).all()
+    for name in ("right_elbow", "right_wrist", "jaw", "left_eye"):
+        assert (rotation[:, joint_index(name)] == 0).all(), name
+    assert (fitted.poses.expression == 0).all()
+    shoulder = rotation[:, joint_index("right_shoulder")]
+    assert (shoulder == torch.tensor([0.0, 0.0, 1.1])).all()
+
+
+def test_frame_without_keypoints_lies_between_its_neighbours(model, masked, fitted):
+    assert fitted.error[3].isnan().all()
+    for values in (fitted.poses.rotation, fitted.poses.transl, fitted.poses.expression):
+        assert torch.isfinite(values).all()
+    moved = joints_of(model, fitted)
+    between = (moved[2] + moved[4]) / 2
+    assert (moved[3] - between)[:22].norm(dim=-1).max() < 0.03
+
+
+def test_clip_without_any_keypoint_stays_finite(model, clip):
+    keypoints = dataclasses.replace(
+        clip.keypoints, pose_image=0 * clip.keypoints.pose_image, pose_world=0 * clip.keypoints.pose_world
+    )
+    fitted = register(*model, keypoints, clip.cameras, FitSettings(iterations=3))
+    assert torch.isfinite(fitted.poses.transl).all() and (fitted.poses.transl[:, 2] < 0).all()
+    assert (fitted.identity.betas == 0).all()
+
+
+def test_equal_input_gives_equal_parameters(model, masked):
+    settings = FitSettings(iterations=12)
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            results.append(register(*model, masked.keypoints, masked.cameras, settings))
+        finally:
+            torch.set_num_threads(before)
+    first, second = results
+    assert torch.equal(first.poses.rotation, second.poses.rotation)
+    assert torch.equal(first.poses.transl, second.poses.transl)
+    assert torch.equal(first.identity.face_offset, second.identity.face_offset)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_shortest_clips(model, count):
+    clip = make_clip(*model, count=count)
+    fitted = register(*model, clip.keypoints, clip.cameras, QUICK)
+    assert len(fitted.poses) == count
+    assert fitted.error[~fitted.error.isnan()].mean() < 1.5
+
+
+def test_dropped_frames_do_not_matter_to_a_steady_motion(model):
+    clip = make_clip(*model, count=4, gap=7)
+    fitted = register(*model, clip.keypoints, clip.cameras, QUICK)
+    assert fitted.poses.frames == (3, 10, 17, 24)
+    assert fitted.error[~fitted.error.isnan()].mean() < 1.5
+
+
+def test_face_points_replace_those_of_the_pose(model):
+    clip = make_clip(*model, count=2, face=True)
+    fitted = register(*model, clip.keypoints, clip.cameras, QUICK)
+    face = fitted.observations.of("face")
+    assert fitted.observations.mask[:, :11].sum() == 0
+    assert fitted.observations.mask[:, face].float().mean() > 0.9
+    assert fitted.error[:, face].nanmean() < 1.0
+
+
+def test_whole_body_points_alone_are_enough(model, clip):
+    alone = whole_body(clip, *model)
+    fitted = register(*model, alone.keypoints, alone.cameras, QUICK)
+    error = fitted.error[:, fitted.observations.of("body")]
+    assert error[~error.isnan()].mean() < 2.0
+
+
+def test_camera_of_its_own_moves_the_world_not_the_picture(model, clip):
+    """A calibrated camera may stand anywhere: the fit is the same one, seen from there."""
+    turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    shift = torch.tensor([0.4, -0.2, 1.0])
+    moved = {
+        frame: dataclasses.replace(camera, rotation=camera.rotation @ turn, translation=shift)
+        for frame, camera in clip.cameras.items()
+    }
+    few = FitSettings(iterations=40)
+    here = register(*model, clip.keypoints, clip.cameras, few)
+    there = register(*model, clip.keypoints, moved, few)
+    camera = moved[clip.poses.frames[0]]
+    seen = joints_of(model, there) @ camera.rotation.mT + shift
+    expected = joints_of(model, here) * torch.tensor([1.0, -1.0, -1.0])
+    assert (seen - expected).norm(dim=-1).mean() < 0.03
+
+
+def test_missing_camera_is_said(model, clip):
+    cameras = dict(list(clip.cameras.items())[1:])
+    with pytest.raises(UserError, match="no camera for frame 3"):
+        register(*model, clip.keypoints, cameras, FitSettings(iterations=1))
+
+
+@pytest.fixture
+def ingest(tmp_path, model):
+    folder = tmp_path / "ingest"
+    for name in ("frames", "masks"):
+        (folder / name).mkdir(parents=True)
+    clip = make_clip(*model, count=2)
+    write_keypoints(folder / "keypoints.parquet", clip.keypoints)
+    write_cameras(folder / "cameras.parquet", clip.cameras)
+    write_footage(
+        folder / "footage.json",
+        Footage("clip.mp4", SIZE, SIZE, 25.0, 1.0, 2, 2, {}, 1, (0.0, 0.04), {"keypoints": "x"}),
+    )
+    for frame in clip.poses.frames:
+        write_frame(folder / "frames", frame, np.full((SIZE, SIZE, 3), 40, np.uint8))
+        write_mask(folder / "masks", frame, np.zeros((SIZE, SIZE), np.uint8))
+    return folder
+
+
+def context_for(ingest, output):
+    output.mkdir()
+
+    @contextlib.contextmanager
+    def progress(total, label):
+        yield SimpleNamespace(advance=lambda n=1, note="": None)
+
+    said = []
+    return SimpleNamespace(
+        subject="toy", settings=FitSettings(iterations=5), inputs={"ingest": ingest}, assets={}, source=None,
+        body=BODY_FOLDER, body_file=BODY_FILE, output=output, work=output.parent, progress=progress,
+        log=said.append, timing=lambda name, value: None, said=said,
+    )  # fmt: skip
+
+
+def test_stage_publishes_its_files_twice_alike(tmp_path, model, ingest):
+    contexts = [context_for(ingest, tmp_path / name) for name in ("a", "b")]
+    for context in contexts:
+        run(context)
+    files = sorted(path.name for path in contexts[0].output.iterdir())
+    assert files == [
+        "identity.safetensors", "overlay.mp4", "overlay.png", "poses.parquet", "residuals.parquet",
+        "template.ply",
+    ]  # fmt: skip
+    for name in files:
+        first, second = ((context.output / name).read_bytes() for context in contexts)
+        assert first == second, name
+    body, output = model[0], contexts[0].output
+    identity, poses = (
+        read_identity(output / "identity.safetensors", body),
+        read_poses(output / "poses.parquet"),
+    )
+    assert poses.frames == (3, 4)
+    mesh = trimesh.load(output / "template.ply", process=False)
+    np.testing.assert_allclose(mesh.vertices, rest_vertices(body, identity).numpy(), atol=1e-6)
+    table = pq.read_table(output / "residuals.parquet").to_pydict()
+    assert table["frame"] == [3, 4] and table["group"] == ["body", "body"]
+    assert all(0 <= pixels < 100 for pixels in table["pixels"])
+    assert "body" in contexts[0].said[-1]
