@@ -6,8 +6,10 @@ import sys
 
 import pytest
 
+from pipeline.job import job_from_words
 from pipeline.stage import load_stages
-from pipeline.workspace import REPOSITORY
+from pipeline.subjects import known_subjects
+from pipeline.workspace import REPOSITORY, open_workspace
 
 
 def imports(path):
@@ -59,3 +61,9 @@ def test_files_stay_short(folder):
         if (lines := path.read_text(encoding="utf-8").count("\n")) > 420
     }
     assert not long
+
+
+def test_every_preset_and_subject_of_the_project_is_valid():
+    for preset in sorted((REPOSITORY / "data" / "presets").glob("*.toml")):
+        for subject in known_subjects(open_workspace()):
+            assert set(job_from_words(subject, {"preset": preset.stem}).settings) == set(load_stages())

@@ -1,0 +1,18 @@
+"""The avatar: a canonical triplane that is decoded to Gaussians and posed with the body."""
+
+from pipeline.avatar.avatar import Architecture, Avatar, Decoded, Posed, Surface, pose_features
+from pipeline.avatar.canonical import Canonical, build_canonical
+from pipeline.avatar.storage import load_avatar, save_avatar
+
+__all__ = [
+    "Architecture",
+    "Avatar",
+    "Canonical",
+    "Decoded",
+    "Posed",
+    "Surface",
+    "build_canonical",
+    "load_avatar",
+    "pose_features",
+    "save_avatar",
+]

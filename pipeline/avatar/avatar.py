@@ -1,0 +1,311 @@
+"""The canonical triplane avatar and what it looks like in a pose (the paper's Sections 3.3 and 3.6).
+
+Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads -> plus
+expression -> linear blend skinning -> Gaussians. The part before the pose is the same for every
+frame: ``decode`` once, ``pose`` as often as needed; a finished avatar does so by itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import roma
+import torch
+from torch import Tensor, nn
+
+from pipeline.avatar.canonical import HANDS, HEAD, Canonical, build_canonical
+from pipeline.avatar.heads import Head
+from pipeline.avatar.sparse import SparsePair
+from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
+from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms, vertex_normals
+from pipeline.splat import Gaussians
+
+LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
+LARGEST_SCALE = 0.03  # metres
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """Everything that must be known to rebuild an avatar's networks; stored in its file.
+
+    Attributes:
+        plane_resolution: texels along a side of each plane.
+        plane_channels: features a texel; three planes give ``f_i`` three times as many.
+        width: hidden channels of the heads.
+        groups: of GroupNorm in the heads.
+        subdivisions: levels of midpoint subdivision of the body mesh.
+        offset_unit, pose_offset_unit: metres that a head's output of 1 stands for.
+        scale: initial standard deviation along the surface, in distances to the neighbours.
+        thickness: initial standard deviation along the normal, in those along the surface.
+        opacity: of every Gaussian.
+    """
+
+    plane_resolution: int = 128
+    plane_channels: int = 32
+    width: int = 128
+    groups: int = 8
+    subdivisions: int = 1
+    offset_unit: float = 0.02
+    pose_offset_unit: float = 0.01
+    scale: float = 0.55
+    thickness: float = 0.5
+    opacity: float = 0.999
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """One level of subdivision: the canonical mesh and the constants that go with it.
+
+    Attributes:
+        canonical: the mesh.
+        samples: from texels to the vertices' features.
+        neighbours: the mean over each vertex's neighbours.
+        pliable: [N, 1] float, 1 where pose heads may move a vertex: not on head and hands, which
+            follow the body model alone.
+    """
+
+    canonical: Canonical
+    samples: SparsePair
+    neighbours: SparsePair
+    pliable: Tensor  # [N, 1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Decoded:
+    """What does not depend on the pose.
+
+    Attributes:
+        surface: the level that was decoded.
+        features: [N, 3 C], ``f_i``.
+        offset: [N, 3], Delta V_tri, metres.
+        log_scale: [N, 3], S_tri, relative to the initial scale.
+        color_logit: [N, 3], C_tri, before the sigmoid.
+    """
+
+    surface: Surface
+    features: Tensor
+    offset: Tensor
+    log_scale: Tensor
+    color_logit: Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Posed:
+    """One frame's Gaussians and the terms that regularisers look at.
+
+    Attributes:
+        gaussians: in world coordinates.
+        pose_offset: [N, 3], Delta V_pose, metres; None while the pose heads are off.
+        log_scale: [N, 3], S_tri + Delta S_pose.
+        color_logit: [N, 3], C_tri + Delta C_pose.
+    """
+
+    gaussians: Gaussians
+    pose_offset: Tensor | None
+    log_scale: Tensor
+    color_logit: Tensor
+
+
+class Avatar(nn.Module):
+    """One person, animatable.
+
+    Attributes:
+        architecture: sizes.
+        kept: [K] int64, the body vertices that carry Gaussians.
+        identity: the fitted identity.
+        body_digest: of the body model that it was built on.
+        surfaces: every level from the unsubdivided mesh to the finest.
+        pose_heads_active: whether the pose heads take part.
+        base_color: [N, 3] logits on the finest level; what the colour heads add to.
+    """
+
+    base_color: Tensor
+
+    def __init__(
+        self,
+        body: BodyModel,
+        identity: Identity,
+        kept: Tensor,  # [K]
+        architecture: Architecture,
+        seed: int = 0,
+        half_precision: bool = True,
+    ):
+        """A new avatar: the fitted body in grey.
+
+        Args:
+            body: the body model.
+            identity: the subject's identity.
+            kept: [K] int64, the body vertices that carry Gaussians, sorted.
+            architecture: sizes.
+            seed: of the initial weights.
+            half_precision: whether the heads run in bfloat16.
+        """
+        super().__init__()
+        self.architecture, self.kept, self.identity = architecture, kept, identity
+        self.body_digest, self.half_precision, self.pose_heads_active = body.digest, half_precision, True
+        meshes = [
+            build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
+        ]
+        regions, self.boxes = _regions(meshes[-1])
+        self.surfaces = [
+            _surface(mesh, regions[: len(mesh)], self.boxes, architecture.plane_resolution) for mesh in meshes
+        ]
+        self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
+        self._build_networks(seed)
+        self._baked: Decoded | None = None
+
+    def _build_networks(self, seed: int) -> None:
+        sizes = self.architecture
+        generator = torch.Generator().manual_seed(seed)
+        self.triplane = Triplane(len(self.boxes), sizes.plane_resolution, sizes.plane_channels, generator)
+        features, pose = self.triplane.features, 6 * (len(self.surfaces[0].canonical.joints) - 1)
+        hidden = {"width": sizes.width, "groups": sizes.groups}
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.geometry = Head(features, 6, **hidden)
+            self.color = Head(features, 3, **hidden)
+            self.pose_geometry = Head(features, 6, condition=pose, **hidden)
+            self.pose_color = Head(features + 3, 3, condition=pose, **hidden)
+
+    def __len__(self) -> int:
+        """The number of Gaussians."""
+        return len(self.surfaces[-1].canonical)
+
+    def train(self, mode: bool = True) -> Avatar:
+        """As of ``nn.Module``; forgets what was decoded, since weights are about to change."""
+        self._baked = None
+        return super().train(mode)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision)
+
+    def decode(self, level: int = -1) -> Decoded:
+        """The pose-independent part, on one level of subdivision (the finest by default)."""
+        surface = self.surfaces[level]
+        features = self.triplane(surface.samples)
+        with self._autocast():
+            geometry, color = self.geometry(features), self.color(features)
+        geometry = geometry.float()
+        return Decoded(
+            surface=surface,
+            features=features,
+            offset=geometry[:, :3] * self.architecture.offset_unit,
+            log_scale=geometry[:, 3:],
+            color_logit=self.base_color[: len(features)] + color.float(),
+        )
+
+    def pose(self, decoded: Decoded, rotation: Tensor, expression: Tensor, transl: Tensor) -> Posed:
+        """The Gaussians of one frame.
+
+        Args:
+            decoded: the pose-independent part.
+            rotation: [55, 3] rotation vectors, radians, the SMPL-X order of joints.
+            expression: [E].
+            transl: [3], metres.
+        """
+        canonical = decoded.surface.canonical
+        transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
+        blended = blend_transforms(transforms, canonical.skinning_weights)
+        shape = decoded.offset + _rest_shape(canonical, rotation, expression)
+        log_scale, color_logit, pose_offset = decoded.log_scale, decoded.color_logit, None
+        if self.pose_heads_active:
+            normals = _posed_normals(blended.detach(), shape.detach(), canonical.faces)
+            pose_offset, scale_change, color_change = self._pose_heads(decoded, rotation, normals)
+            shape, log_scale = shape + pose_offset, log_scale + scale_change
+            color_logit = color_logit + color_change
+        gaussians = Gaussians(
+            means=_transform(blended, shape) + transl,
+            quaternions=_quaternions(blended.detach()[..., :3] @ canonical.frames),
+            scales=self._scales(canonical, log_scale),
+            colors=torch.sigmoid(color_logit),
+            opacities=torch.full((len(canonical),), self.architecture.opacity),
+        )
+        return Posed(gaussians, pose_offset, log_scale, color_logit)
+
+    def _pose_heads(self, decoded: Decoded, rotation: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
+        """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
+        features = decoded.features
+        theta = pose_features(rotation.detach())
+        with self._autocast():
+            geometry = self.pose_geometry(features, theta)
+            color = self.pose_color(torch.cat([features, normals], 1), theta)
+        geometry = geometry.float()
+        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
+        return offset, 0.5 * geometry[:, 3:], color.float()
+
+    def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
+        across = canonical.spacing * self.architecture.scale
+        thick = across.mean(1, keepdim=True) * self.architecture.thickness
+        initial = torch.cat([across, thick], 1)
+        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+
+    def gaussians(
+        self, rotation: Tensor, expression: Tensor, transl: Tensor, time: float | None = None
+    ) -> Gaussians:
+        """The finished avatar in a pose, world coordinates.
+
+        The pose-independent part is decoded on the first call and kept until ``train()`` is called.
+        Gradients reach the pose.
+
+        Args:
+            rotation: [55, 3] rotation vectors, radians.
+            expression: [E].
+            transl: [3], metres.
+            time: seconds into the clip, for effects that depend on it; no effect does so far.
+        """
+        if self._baked is None:
+            with torch.no_grad():
+                self._baked = self.decode()
+        return self.pose(self._baked, rotation, expression, transl).gaussians
+
+
+def pose_features(rotation: Tensor) -> Tensor:
+    """The pose that heads are conditioned on, ``theta`` without the root.
+
+    Two columns of each joint's rotation matrix, the identity's subtracted, so that the rest pose is
+    zero: [55, 3] rotation vectors -> [54 * 6].
+    """
+    matrices = roma.rotvec_to_rotmat(rotation[1:])
+    return (matrices - torch.eye(3))[:, :, :2].reshape(-1)
+
+
+def _regions(finest: Canonical) -> tuple[Tensor, Tensor]:
+    """The triplane regions of the finest level's vertices, [N], and their boxes, [R, 2, 3].
+
+    Head and rest of the body, or a single region when only one of them is kept.
+    """
+    head = finest.is_part(*HEAD)
+    both = bool(head.any()) and not bool(head.all())
+    regions = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
+    return regions, region_boxes(finest.vertices, regions)
+
+
+def _surface(mesh: Canonical, regions: Tensor, boxes: Tensor, resolution: int) -> Surface:
+    coordinates = normalise(mesh.vertices, regions, boxes)
+    samples = sampling(coordinates, regions, len(boxes), resolution)
+    pliable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
+    return Surface(mesh, samples, mesh.neighbour_mean(), pliable)
+
+
+def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> Tensor:
+    """The vertices before skinning: rest shape, expression and, if the body has them, correctives."""
+    shape = canonical.vertices + canonical.expression_directions[..., : len(expression)] @ expression
+    if canonical.pose_directions is None:
+        return shape
+    matrices = roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)
+    return shape + canonical.pose_directions @ matrices.reshape(-1)
+
+
+def _transform(blended: Tensor, points: Tensor) -> Tensor:
+    # A batched 3x3 product is many times slower on a CPU than the sum written out.
+    return (blended[..., :3] * points[:, None, :]).sum(-1) + blended[..., 3]
+
+
+def _posed_normals(blended: Tensor, points: Tensor, faces: Tensor) -> Tensor:
+    with torch.no_grad():
+        return vertex_normals(_transform(blended, points), faces)
+
+
+def _quaternions(matrices: Tensor) -> Tensor:
+    """Nearly orthonormal matrices as unit quaternions, wxyz: [N, 3, 3] -> [N, 4]."""
+    return roma.rotmat_to_unitquat(matrices)[:, [3, 0, 1, 2]].contiguous()

@@ -1,0 +1,172 @@
+"""The canonical mesh that carries the Gaussians: one a vertex (the paper's Section 3.3).
+
+The order of making it: the identity's rest mesh; the vertices that any frame can show (see
+``stages/train/visibility.py``); midpoint subdivision of what is left. The gate comes before the
+subdivision, so that a finer mesh is gated exactly as the coarse one was.
+
+Canonical positions are those of the rest pose, in metres, Y up, the subject's left at +X.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from pipeline.avatar.sparse import SparsePair
+from pipeline.body import (
+    PARTS,
+    BodyModel,
+    Identity,
+    edges,
+    part_labels,
+    rest_joints,
+    rest_vertices,
+    subdivide,
+    vertex_normals,
+)
+
+HEAD = ("head", "face")
+HANDS = ("left_hand", "right_hand")
+SMALLEST_SPACING, LARGEST_SPACING = 1e-3, 0.05  # metres; a guard against slivers and huge triangles
+
+
+@dataclasses.dataclass(frozen=True)
+class Canonical:
+    """The Gaussians' home.
+
+    Attributes:
+        vertices: [N, 3], metres.
+        faces: [F, 3] int64.
+        skinning_weights: [N, 55], rows sum to 1.
+        expression_directions: [N, 3, E], metres a unit of expression.
+        pose_directions: [N, 3, 486], the body's pose correctives, or None if it has none.
+        parts: [N] int64, index into ``pipeline.body.parts.PARTS``.
+        frames: [N, 3, 3], columns are two tangents and the outward normal at rest.
+        spacing: [N, 2], how far a vertex's neighbours lie along each of the two tangents, metres.
+        joints: [55, 3], rest joints, metres.
+        parents: parent of each joint, -1 for the root.
+    """
+
+    vertices: Tensor  # [N, 3]
+    faces: Tensor  # [F, 3]
+    skinning_weights: Tensor  # [N, 55]
+    expression_directions: Tensor  # [N, 3, E]
+    pose_directions: Tensor | None  # [N, 3, 486]
+    parts: Tensor  # [N]
+    frames: Tensor  # [N, 3, 3]
+    spacing: Tensor  # [N, 2]
+    joints: Tensor  # [55, 3]
+    parents: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def is_part(self, *names: str) -> Tensor:
+        """[N] bool: the vertices of the named parts."""
+        wanted = torch.tensor([PARTS.index(name) for name in names])
+        return torch.isin(self.parts, wanted)
+
+    def neighbour_mean(self) -> SparsePair:
+        """[N, N]: the mean over a vertex's neighbours, the uniform Laplacian's second half."""
+        start, end = directed_edges(self.faces).unbind(1)
+        degree = torch.bincount(start, minlength=len(self)).clamp_min(1)
+        return SparsePair.build(start, end, 1.0 / degree[start].float(), (len(self), len(self)))
+
+
+def directed_edges(faces: Tensor) -> Tensor:
+    """Every edge of a triangle mesh once in each direction: [F, 3] -> [2 E, 2]."""
+    once = edges(faces)
+    return torch.cat([once, once.flip(1)])
+
+
+def dilate(kept: Tensor, faces: Tensor, rings: int) -> Tensor:
+    """Adds the neighbours of the kept vertices, ``rings`` times: [V] bool -> [V] bool."""
+    start, end = directed_edges(faces).unbind(1)
+    for _ in range(rings):
+        kept = kept.clone()
+        kept[end[kept[start]]] = True
+    return kept
+
+
+def build_canonical(
+    body: BodyModel, identity: Identity, levels: int, kept: Tensor | None = None
+) -> Canonical:
+    """The canonical mesh of one identity.
+
+    Args:
+        body: the body model.
+        identity: the subject's fitted identity.
+        levels: of midpoint subdivision: 0, 1 or 2.
+        kept: [K] int64, body vertices that stay, sorted; all of them if None. A triangle stays if
+            its three vertices do, a vertex stays even when no triangle of it does.
+
+    Raises:
+        ValueError: if ``kept`` is empty or names a vertex that the body has not.
+    """
+    vertices, faces = rest_vertices(body, identity), body.faces
+    if kept is None:
+        kept = torch.arange(len(vertices))
+    if len(kept) == 0 or int(kept.max()) >= len(vertices):
+        raise ValueError(f"the kept vertices must be some of the body's {len(vertices)}")
+    carried = [
+        vertices,
+        body.skinning_weights,
+        body.expression_directions,
+        functional.one_hot(part_labels(body).long(), len(PARTS)).float(),
+        vertex_normals(vertices, faces),
+    ]
+    if body.pose_directions is not None:
+        carried.append(body.pose_directions)
+    faces = _faces_of(faces, kept, len(vertices))
+    faces, attributes = subdivide(faces, *(attribute[kept] for attribute in carried), levels=levels)
+    vertices, weights, directions, labels, normals, *correctives = attributes
+    frames = tangent_frames(functional.normalize(normals, dim=-1))
+    return Canonical(
+        vertices=vertices,
+        faces=faces,
+        skinning_weights=weights,
+        expression_directions=directions,
+        pose_directions=correctives[0] if correctives else None,
+        parts=labels.argmax(1),
+        frames=frames,
+        spacing=tangent_spacing(vertices, faces, frames),
+        joints=rest_joints(body, identity),
+        parents=body.parents,
+    )
+
+
+def tangent_frames(normals: Tensor) -> Tensor:
+    """A right-handed frame at each normal: [N, 3] -> [N, 3, 3], columns tangent, bitangent, normal.
+
+    The first tangent is horizontal where the normal is not nearly vertical, so that neighbours have
+    similar frames; there it is taken across the body's Z axis instead.
+    """
+    up = torch.tensor([0.0, 1.0, 0.0]).expand_as(normals)
+    forward = torch.tensor([0.0, 0.0, 1.0]).expand_as(normals)
+    axis = torch.where(normals[:, 1:2].abs() > 0.95, forward, up)
+    tangent = functional.normalize(torch.linalg.cross(axis, normals), dim=-1)
+    return torch.stack([tangent, torch.linalg.cross(normals, tangent), normals], -1)
+
+
+def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
+    """How far each vertex's neighbours lie along its two tangents, [N, 2], metres, within sane bounds.
+
+    ``sqrt(2 mean (e . t)^2)`` over the edges e at the vertex: the edge length where triangles are
+    regular, and more along than across where they are long and thin. Round Gaussians of the mean
+    edge length would leave gaps there, as on the limbs.
+    """
+    start, end = directed_edges(faces).unbind(1)
+    along = torch.einsum("ec,eck->ek", vertices[end] - vertices[start], frames[start][:, :, :2]).square()
+    total = torch.zeros(len(vertices), 2).index_add_(0, start, along)
+    degree = torch.bincount(start, minlength=len(vertices)).clamp_min(1)
+    return (2 * total / degree[:, None]).sqrt().clamp(SMALLEST_SPACING, LARGEST_SPACING)
+
+
+def _faces_of(faces: Tensor, kept: Tensor, count: int) -> Tensor:
+    new_index = torch.full((count,), -1, dtype=torch.long)
+    new_index[kept] = torch.arange(len(kept))
+    inside = (new_index[faces] >= 0).all(1)
+    return new_index[faces[inside]]

@@ -1,0 +1,64 @@
+"""A constant sparse matrix times a dense one, with a gradient for the dense one only.
+
+What never moves during training (which texels a canonical point reads, which vertices are
+neighbours) is written once as a sparse matrix. Its transpose is kept beside it, because the
+gradient is a product with the transpose and torch would rebuild that on every backward pass.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import scipy.sparse
+import torch
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class SparsePair:
+    """A constant sparse matrix and its transpose, both in compressed rows.
+
+    Attributes:
+        matrix: [M, K] sparse CSR, float32.
+        transpose: [K, M] sparse CSR, float32.
+    """
+
+    matrix: Tensor  # [M, K]
+    transpose: Tensor  # [K, M]
+
+    @classmethod
+    def build(cls, rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> SparsePair:
+        """The pair for the given entries; entries at the same place add up.
+
+        Args:
+            rows: [E] int64.
+            columns: [E] int64.
+            values: [E] floating point.
+            shape: (M, K).
+        """
+        entries = scipy.sparse.coo_array((values.numpy(), (rows.int().numpy(), columns.int().numpy())), shape)
+        return cls(_to_torch(entries.tocsr()), _to_torch(entries.T.tocsr()))
+
+    def __matmul__(self, dense: Tensor) -> Tensor:
+        """``matrix @ dense``, [K, C] -> [M, C]; the backward pass is ``transpose @ gradient``."""
+        return _Product.apply(dense, self)
+
+
+def _to_torch(matrix: scipy.sparse.csr_array) -> Tensor:
+    matrix.sort_indices()
+    rows, columns, values = (torch.from_numpy(part) for part in (matrix.indptr, matrix.indices, matrix.data))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(rows, columns, values, matrix.shape, check_invariants=False)
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, dense: Tensor, pair: SparsePair) -> Tensor:
+        ctx.pair = pair
+        return pair.matrix @ dense
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.pair.transpose @ gradient.contiguous(), None

@@ -1,0 +1,87 @@
+"""An avatar as one safetensors file: arrays and JSON, nothing that could run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import safetensors
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from pipeline.avatar.avatar import Architecture, Avatar
+from pipeline.body import BodyModel, Identity
+from pipeline.errors import UserError
+
+FORMAT = "flexiavatar-avatar-1"
+IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
+
+
+def save_avatar(path: Path, avatar: Avatar) -> None:
+    """Writes the avatar; equal avatars give equal bytes.
+
+    The file holds the weights, the identity and which body vertices are kept. The body model itself
+    is not in it: ``load_avatar`` needs the one that the avatar was built on.
+
+    Raises:
+        ValueError: if any number in it is not finite.
+    """
+    tensors = {f"network.{name}": tensor for name, tensor in avatar.state_dict().items()}
+    for field in IDENTITY_FIELDS:
+        tensors[f"identity.{field}"] = torch.as_tensor(getattr(avatar.identity, field))
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{name} of the avatar holds numbers that are not finite")
+    tensors["kept"] = avatar.kept
+    header = {
+        "format": FORMAT,
+        "body": avatar.body_digest,
+        "architecture": dataclasses.asdict(avatar.architecture),
+        "half_precision": avatar.half_precision,
+        "pose_heads_active": avatar.pose_heads_active,
+    }
+    # One entry only: safetensors writes several in an order of its own, different in each process.
+    metadata = {"avatar": json.dumps(header, sort_keys=True)}
+    save_file({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, path, metadata)
+
+
+def load_avatar(path: Path, body: BodyModel) -> Avatar:
+    """Reads an avatar, ready to be posed.
+
+    Args:
+        path: an ``avatar.safetensors``.
+        body: the body model that it was trained on.
+
+    Raises:
+        UserError: if the file is no avatar, is damaged, or belongs to another body model.
+    """
+    header, tensors = _read(path)
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path} is not an avatar of this version; run the train stage again")
+    if header["body"] != body.digest:
+        raise UserError(f"{path} was trained on another body model; use that one, or run fit and train again")
+    identity = Identity(**{field: tensors[f"identity.{field}"] for field in IDENTITY_FIELDS})
+    architecture = Architecture(**header["architecture"])
+    avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=header["half_precision"])
+    weights = {
+        name.removeprefix("network."): tensor
+        for name, tensor in tensors.items()
+        if name.startswith("network.")
+    }
+    try:
+        avatar.load_state_dict(weights)
+    except RuntimeError as error:
+        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    avatar.pose_heads_active = header["pose_heads_active"]
+    return avatar.eval()
+
+
+def _read(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("avatar", "{}"))
+            return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
+        raise UserError(f"{path} cannot be read ({error}); run the train stage again") from error

@@ -1,0 +1,16 @@
+"""Training: frames, masks, cameras and poses to an animatable avatar (paper, Sections 3.3 to 3.6)."""
+
+from pipeline.stage import Stage
+from stages.train.settings import TrainSettings
+
+STAGE = Stage(
+    name="train",
+    version=1,
+    settings=TrainSettings,
+    run="stages.train.run:run",
+    needs={
+        "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json"),
+        "fit": ("identity.safetensors", "poses.parquet"),
+    },
+    reads_body=True,
+)

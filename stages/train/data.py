@@ -1,0 +1,132 @@
+"""The training frames: what the losses compare a rendering with."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.frames import read_frame, read_mask
+from stages.train.losses import WINDOW
+
+FAINTEST = 8  # of 255: alpha under this is taken for noise when the person's box is sought
+CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are drawn
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """One frame's crop around the person.
+
+    Attributes:
+        color: [H, W, 3] in [0, 1], the whole picture, not only the person.
+        alpha: [H, W] in [0, 1], the person's soft mask.
+        camera: of the crop.
+    """
+
+    color: Tensor  # [H, W, 3]
+    alpha: Tensor  # [H, W]
+    camera: Camera
+
+    def composite(self, background: Tensor) -> Tensor:
+        """The person over a plain background, [3] -> [H, W, 3]."""
+        alpha = self.alpha[..., None]
+        return self.color * alpha + (1 - alpha) * background
+
+
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """A rectangle of pixels: columns left to right - 1, rows top to bottom - 1."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class Frames:
+    """Crops of numbered frames, kept in memory as far as it is reasonable."""
+
+    def __init__(self, folder: Path, cameras: Mapping[int, Camera], box: Box | None = None):
+        """Reads nothing yet.
+
+        Args:
+            folder: what ingest published.
+            cameras: of every frame.
+            box: the part of each frame to return; the whole frame if None.
+        """
+        self.folder, self.cameras, self.box = folder, cameras, box
+        camera = next(iter(cameras.values()))
+        pixels = (box.right - box.left) * (box.bottom - box.top) if box else camera.width * camera.height
+        self._read = functools.lru_cache(maxsize=max(1, CACHED_BYTES // (4 * pixels)))(self._load)
+
+    def __getitem__(self, frame: int) -> View:
+        """The crop of frame number ``frame``."""
+        color, alpha = self._read(frame)
+        box, camera = self.box, self.cameras[frame]
+        if box is not None:
+            camera = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
+        return View(torch.from_numpy(color).float() / 255, torch.from_numpy(alpha).float() / 255, camera)
+
+    def _load(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        color, alpha = read_frame(self.folder / "frames", frame), read_mask(self.folder / "masks", frame)
+        camera = self.cameras[frame]
+        if color.shape[:2] != alpha.shape or alpha.shape != (camera.height, camera.width):
+            raise UserError(
+                f"{self.folder}: frame, mask and camera {frame} differ in size; run the ingest stage again"
+            )
+        if self.box is None:
+            return color, alpha
+        rows, columns = slice(self.box.top, self.box.bottom), slice(self.box.left, self.box.right)
+        return np.ascontiguousarray(color[rows, columns]), np.ascontiguousarray(alpha[rows, columns])
+
+
+def person_box(folder: Path, frames: tuple[int, ...], margin: int) -> Box:
+    """The smallest box that holds the person in all the given frames, and a margin.
+
+    It is at least as large as SSIM's window.
+
+    Raises:
+        UserError: if no mask shows anybody, or the frames are smaller than SSIM's window.
+    """
+    columns, rows = np.zeros(0, bool), np.zeros(0, bool)
+    for frame in frames:
+        person = np.asarray(read_mask(folder / "masks", frame) >= FAINTEST)
+        columns = _either(columns, np.any(person, axis=0))
+        rows = _either(rows, np.any(person, axis=1))
+    if not columns.any():
+        raise UserError(f"{folder / 'masks'} shows nobody in the training frames; check the footage")
+    if min(len(columns), len(rows)) < WINDOW:
+        raise UserError(f"{folder / 'frames'}: frames must be at least {WINDOW} pixels wide and high")
+    left, right = _extent(columns, margin)
+    top, bottom = _extent(rows, margin)
+    return Box(left, top, right, bottom)
+
+
+def _either(known: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Marks of frames that may differ in size."""
+    if len(known) < len(new):
+        known, new = new, known
+    return known | np.pad(new, (0, len(known) - len(new)))
+
+
+def _extent(marks: np.ndarray, margin: int) -> tuple[int, int]:
+    inside = np.flatnonzero(marks)
+    first, last = max(0, int(inside[0]) - margin), min(len(marks), int(inside[-1]) + 1 + margin)
+    if last - first < WINDOW:
+        first = max(0, min(first, len(marks) - WINDOW))
+        last = first + WINDOW
+    return first, last
+
+
+def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """At most ``count`` of the frames, evenly spread over them."""
+    if len(frames) <= count:
+        return frames
+    return tuple(frames[position * len(frames) // count] for position in range(count))

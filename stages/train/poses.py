@@ -1,0 +1,85 @@
+"""Refinement of the training frames' poses, jointly with the avatar (paper, Section 3.6)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.body import Poses
+
+
+@dataclasses.dataclass(frozen=True)
+class FramePose:
+    """One frame's pose.
+
+    Attributes:
+        rotation: [55, 3] rotation vectors, radians.
+        expression: [E].
+        transl: [3], metres.
+    """
+
+    rotation: Tensor  # [55, 3]
+    expression: Tensor  # [E]
+    transl: Tensor  # [3]
+
+
+class PoseRefinement(nn.Module):
+    """A change of pose for every frame that may move.
+
+    Each frame has parameters of its own: in one tensor for all frames, Adam's momentum would go on
+    moving frames that were not drawn.
+    """
+
+    def __init__(self, poses: Poses, frames: tuple[int, ...]):
+        """Starts at the fitted poses.
+
+        Args:
+            poses: of the whole clip.
+            frames: the frame numbers whose poses may change: the training frames.
+        """
+        super().__init__()
+        self.poses = poses
+        self.rows = {frame: row for row, frame in enumerate(poses.frames)}
+        width = poses.expression.shape[1]
+        self.rotation = _each(frames, (55, 3))
+        self.expression = _each(frames, (width,))
+        self.transl = _each(frames, (3,))
+
+    def fitted(self, frame: int) -> FramePose:
+        """The pose that the fit gave a frame."""
+        row = self.rows[frame]
+        return FramePose(self.poses.rotation[row], self.poses.expression[row], self.poses.transl[row])
+
+    def forward(self, frame: int) -> FramePose:
+        """The refined pose of a training frame, the fitted pose of any other."""
+        pose, name = self.fitted(frame), str(frame)
+        if name not in self.rotation:
+            return pose
+        return FramePose(
+            pose.rotation + self.rotation[name],
+            pose.expression + self.expression[name],
+            pose.transl + self.transl[name],
+        )
+
+    def change(self, frame: int) -> Tensor:
+        """Mean squared change of a training frame's pose; radians, expression units, decimetres."""
+        name = str(frame)
+        parts = [self.rotation[name].flatten(), self.expression[name], 10 * self.transl[name]]
+        return torch.cat(parts).square().mean()
+
+    def refined(self) -> Poses:
+        """All frames' poses as they now are."""
+        with torch.no_grad():
+            each = [self(frame) for frame in self.poses.frames]
+        return Poses(
+            frames=self.poses.frames,
+            rotation=torch.stack([pose.rotation for pose in each]),
+            expression=torch.stack([pose.expression for pose in each]),
+            transl=torch.stack([pose.transl for pose in each]),
+        )
+
+
+def _each(frames: tuple[int, ...], shape: tuple[int, ...]) -> nn.ParameterDict:
+    return nn.ParameterDict({str(frame): nn.Parameter(torch.zeros(shape)) for frame in frames})

@@ -1,0 +1,47 @@
+"""Everything that depends on the iteration alone: rates, what is active, and random draws.
+
+Draws have no state. Each is made from (seed, purpose, position), so that a run that was killed and
+resumed draws what an uninterrupted one would have drawn.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.train.settings import TrainSettings
+
+FRAMES, BACKGROUND = 1, 2  # purposes
+
+
+def rate_factor(settings: TrainSettings, iteration: int) -> float:
+    """What learning rates are multiplied with: a short linear rise, then a cosine."""
+    done = iteration / settings.iterations
+    cosine = 0.5 * (1 + math.cos(math.pi * done))
+    warm = min(1.0, (iteration + 1) / max(1, settings.warm_up))
+    return warm * (settings.final_rate + (1 - settings.final_rate) * cosine)
+
+
+def reached(settings: TrainSettings, fraction: float, iteration: int) -> bool:
+    """Whether the run has come as far as ``fraction``; never for a fraction of 1."""
+    return iteration >= fraction * settings.iterations
+
+
+def drawn_frame(seed: int, frames: tuple[int, ...], position: int) -> int:
+    """The frame of the ``position``-th draw: every frame once, in random order, then again."""
+    epoch, place = divmod(position, len(frames))
+    return frames[_order(seed, len(frames), epoch)[place]]
+
+
+@functools.lru_cache(maxsize=2)
+def _order(seed: int, count: int, epoch: int) -> np.ndarray:
+    return np.random.default_rng([seed, FRAMES, epoch]).permutation(count)
+
+
+def drawn_background(seed: int, position: int) -> Tensor:
+    """A uniformly random colour, [3]."""
+    return torch.from_numpy(np.random.default_rng([seed, BACKGROUND, position]).random(3, np.float32))

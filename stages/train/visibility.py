@@ -1,0 +1,118 @@
+"""What the training frames show of the body: which vertices to keep, and their first colours.
+
+A clip of a head says nothing about the feet. Before training, the fitted body is rendered in some
+training frames; what none of them shows, and is not next to something shown, gets no Gaussian at
+all (the idea of the paper's Section 3.4, applied once and early).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Avatar
+from pipeline.avatar.canonical import dilate
+from pipeline.splat import Gaussians, render
+from pipeline.tables import write_table
+from stages.train.data import Frames
+from stages.train.poses import PoseRefinement
+
+SCHEMA = pa.schema(
+    [("vertex", pa.int32()), ("frames", pa.int32()), ("weight", pa.float32()), ("kept", pa.bool_())]
+)
+DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
+SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
+
+
+@dataclasses.dataclass(frozen=True)
+class Visibility:
+    """Evidence for each body vertex.
+
+    Attributes:
+        looked_at: how many frames were rendered.
+        frames: [V] int64, in how many of them the vertex contributed to the image.
+        weight: [V], its blending weight summed over pixels and frames.
+        kept: [V] bool, whether it carries a Gaussian.
+    """
+
+    looked_at: int
+    frames: Tensor  # [V]
+    weight: Tensor  # [V]
+    kept: Tensor  # [V]
+
+
+def measure(
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], rings: int
+) -> Visibility:
+    """Renders the fitted body in the chosen frames.
+
+    Args:
+        avatar: untrained, unsubdivided and with every body vertex.
+        poses: of every frame.
+        views: the cameras.
+        chosen: frame numbers.
+        rings: of neighbours that are kept with what was seen.
+    """
+    frames, weight = torch.zeros(len(avatar), dtype=torch.long), torch.zeros(len(avatar))
+    with torch.no_grad():
+        for frame in chosen:
+            rendering = render(_gaussians(avatar, poses, frame), views[frame].camera)
+            frames += rendering.weights > 0
+            weight += rendering.weights
+    kept = dilate(frames > 0, avatar.surfaces[0].canonical.faces, rings)
+    return Visibility(len(chosen), frames, weight, kept)
+
+
+def write_visibility(path: Path, visibility: Visibility) -> None:
+    """Writes ``visibility.parquet``: a row a body vertex."""
+    columns = {
+        "vertex": np.arange(len(visibility.frames)),
+        "frames": visibility.frames.numpy(),
+        "weight": visibility.weight.numpy(),
+        "kept": visibility.kept.numpy(),
+    }
+    write_table(path, SCHEMA, columns)
+
+
+def first_colors(avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]) -> Tensor:
+    """Logits of the mean colour that the chosen frames show at each Gaussian, [N, 3].
+
+    The weights of that mean are the blending weights. They come from the renderer's own backward
+    pass: the derivative of ``sum(rendering * picture)`` with respect to a Gaussian's colour is the
+    sum of the pixels that it covers, each times its blending weight there.
+    """
+    total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar), 1)
+    for frame in chosen:
+        view = views[frame]
+        with torch.no_grad():
+            gaussians = _gaussians(avatar, poses, frame)
+        colors = gaussians.colors.clone().requires_grad_()
+        color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
+        person = (view.alpha > 0.5).float()[..., None]
+        total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
+        weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
+    neighbours = avatar.surfaces[-1].neighbours
+    return torch.logit(_fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+
+
+def _fill(total: Tensor, weight: Tensor, neighbours) -> Tensor:
+    """Mean colours; what has no weight takes those of its neighbours, then the overall mean."""
+    known = (weight > 0).float()
+    color = total / weight.clamp_min(1e-12) * known
+    overall = total.sum(0) / weight.sum().clamp_min(1e-12)
+    for _ in range(SPREAD_ROUNDS):
+        near, share = neighbours @ (color * known), neighbours @ known
+        reached = (known == 0) & (share > 0)
+        color = torch.where(reached, near / share.clamp_min(1e-12), color)
+        known = torch.where(reached, 1.0, known)
+    return torch.where(known > 0, color, overall)
+
+
+def _gaussians(avatar: Avatar, poses: PoseRefinement, frame: int) -> Gaussians:
+    pose = poses.fitted(frame)
+    return avatar.gaussians(pose.rotation, pose.expression, pose.transl)

@@ -1,0 +1,266 @@
+"""The train stage on a tiny synthetic subject: what it learns, resumes, publishes and refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar import load_avatar
+from pipeline.body import Poses, load_body, read_poses, write_poses
+from pipeline.errors import UserError
+from pipeline.frames import write_mask
+from pipeline.splat import render
+from pipeline.tables import read_table
+from stages.train import curve, losses, visibility
+from stages.train import run as stage
+from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
+from stages.train.loop import Trainer
+from tests.stages.train_subject import BODY_FILE, context_for, write_subject
+
+PUBLISHED = {"avatar.safetensors", "curve.parquet", "poses.parquet", "visibility.parquet"}
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(subject):
+    """One uninterrupted run."""
+    context = context_for(subject, subject / "finished")
+    stage.run(context)
+    return context.output
+
+
+def trainer_for(context) -> Trainer:
+    inputs = stage.read_inputs(context)
+    refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
+    avatar, _ = stage.prepare(inputs, refinement, context.settings, context)
+    return Trainer(avatar, refinement, inputs.crops, inputs.split.train, context.settings)
+
+
+def bytes_of(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_publishes_everything_and_all_of_it_finite(finished):
+    assert set(bytes_of(finished)) == PUBLISHED
+    rows = read_table(finished / "curve.parquet", curve.SCHEMA, "")
+    assert {"l1", "ssim", "laplacian_offset", "psnr", "gaussians"} <= set(rows["name"])
+    assert set(rows["iteration"]) == {6, 12}
+
+
+def test_same_seed_same_bytes(subject, finished, tmp_path):
+    again = context_for(subject, tmp_path / "again")
+    stage.run(again)
+    assert bytes_of(again.output) == bytes_of(finished)
+
+
+def test_another_seed_another_avatar(subject, tmp_path):
+    first, same, other = (
+        trainer_for(context_for(subject, tmp_path / name, seed=seed))
+        for name, seed in (("first", 0), ("same", 0), ("other", 1))
+    )
+    weights = [torch.nn.utils.parameters_to_vector(one.avatar.parameters()) for one in (first, same, other)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing of ours catches it."""
+
+
+def test_killed_and_rerun_gives_the_same_bytes(subject, finished, tmp_path, monkeypatch):
+    context = context_for(subject, tmp_path / "out")
+    original = Trainer.step
+
+    def step(self):
+        if self.iteration == 8:
+            raise Killed
+        return original(self)
+
+    monkeypatch.setattr(Trainer, "step", step)
+    with pytest.raises(Killed):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+    assert (context.work / NAME).exists()
+    monkeypatch.undo()
+    messages = []
+    context.log = messages.append
+    stage.run(context)
+    assert any("goes on from iteration 5" in message for message in messages)
+    assert bytes_of(context.output) == bytes_of(finished)
+
+
+def test_checkpoint_of_another_run_is_left_alone(tmp_path):
+    written = Checkpoint(5, "this run", {"weight": torch.arange(3.0)}, {"rows": [[1, "l1", 0.5]]})
+    write_checkpoint(tmp_path, written)
+    assert read_checkpoint(tmp_path, "another run") is None
+    read = read_checkpoint(tmp_path, "this run")
+    assert read.iteration == 5 and read.extra == written.extra
+    assert torch.equal(read.tensors["weight"], torch.arange(3.0))
+    assert [path.name for path in tmp_path.iterdir()] == [NAME]
+
+
+def test_run_key_changes_with_settings_and_inputs():
+    poses = torch.zeros(4, 3)
+    key = run_key({"seed": 0}, [poses])
+    assert key == run_key({"seed": 0}, [poses.clone()])
+    assert len({key, run_key({"seed": 1}, [poses]), run_key({"seed": 0}, [poses + 1])}) == 3
+
+
+@pytest.mark.parametrize("size", [0, 100, 5000])
+def test_cut_off_checkpoint_is_no_checkpoint(tmp_path, size):
+    (tmp_path / NAME).write_bytes(b"\x10" * size)
+    assert read_checkpoint(tmp_path, "key") is None
+
+
+def test_training_comes_closer_to_the_training_frames(subject, tmp_path):
+    context = context_for(
+        subject,
+        tmp_path / "out",
+        iterations=15,
+        initial_color=False,
+        subdivisions=1,
+        subdivide_from=0.8,
+        learning_rate=1e-2,
+        warm_up=1,
+    )
+    inputs, trainer = stage.read_inputs(context), trainer_for(context)
+    before = trainer.held_out(inputs.whole, inputs.split.train)
+    assert trainer.level == 0
+    while trainer.iteration < 15:
+        trainer.step()
+    assert trainer.level == 1
+    assert trainer.held_out(inputs.whole, inputs.split.train) > before + 3
+
+
+def test_first_colors_are_near_the_truth(subject, tmp_path):
+    context = context_for(subject, tmp_path / "out")
+    inputs, trainer = stage.read_inputs(context), trainer_for(context)
+    grey = trainer_for(context_for(subject, tmp_path / "grey", initial_color=False))
+    frames = inputs.split.test
+    assert trainer.held_out(inputs.whole, frames) > grey.held_out(inputs.whole, frames) + 5
+
+
+def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
+    table = read_table(finished / "visibility.parquet", visibility.SCHEMA, "")
+    seen, kept = table["frames"] > 0, table["kept"]
+    assert kept[seen].all() and seen.sum() < kept.sum() < len(kept) / 2
+    assert np.array_equal(table["weight"] > 0, seen)
+    body = load_body(BODY_FILE)
+    assert body.v_template[~torch.from_numpy(kept), 1].min() < -1  # the feet are gone
+    context = context_for(subject, tmp_path / "open", gate=False)
+    assert len(trainer_for(context).avatar) == len(kept)
+
+
+def test_refined_poses_change_in_training_frames_only(subject, finished):
+    fitted, refined = read_poses(subject / "fit" / "poses.parquet"), read_poses(finished / "poses.parquet")
+    assert fitted.frames == refined.frames
+    assert (refined.rotation[:-1] != fitted.rotation[:-1]).any(2).any(1).all()
+    assert torch.equal(refined.rotation[-1], fitted.rotation[-1])
+    assert torch.equal(refined.transl[-1], fitted.transl[-1])
+    assert (refined.rotation - fitted.rotation).abs().max() < 0.05
+
+
+def test_only_drawn_frames_move(subject, tmp_path):
+    trainer = trainer_for(context_for(subject, tmp_path / "out", refine_from=0.0))
+    trainer.step()
+    trainer.step()
+    moved = [name for name, change in trainer.poses.rotation.items() if bool((change != 0).any())]
+    assert len(moved) == 2
+
+
+def test_published_avatar_renders_the_held_out_frame(subject, finished):
+    body = load_body(BODY_FILE)
+    avatar = load_avatar(finished / "avatar.safetensors", body)
+    inputs = stage.read_inputs(context_for(subject, finished.with_name("unused")))
+    view = inputs.whole[5]
+    with torch.no_grad():
+        pose = inputs.poses
+        gaussians = avatar.gaussians(pose.rotation[5], pose.expression[5], pose.transl[5])
+        rendering = render(gaussians, view.camera)
+    error = (rendering.color - view.composite(torch.zeros(3))).square().mean()
+    curve_rows = read_table(finished / "curve.parquet", curve.SCHEMA, "")
+    last = curve_rows["value"][(curve_rows["name"] == "psnr") & (curve_rows["iteration"] == 12)]
+    assert -10 * torch.log10(error) == pytest.approx(float(last[0]), abs=0.05)
+
+
+def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_path, monkeypatch):
+    context = context_for(subject, tmp_path / "out")
+    calls = []
+
+    def poisoned(image, target):
+        calls.append(1)
+        return losses.l1(image, target) * (float("nan") if len(calls) == 8 else 1)
+
+    monkeypatch.setattr(losses, "ssim", poisoned)
+    with pytest.raises(UserError, match="loss term 'ssim' is nan at iteration 7"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def test_weight_that_is_not_finite_is_never_published(subject, tmp_path, monkeypatch):
+    context = context_for(subject, tmp_path / "out")
+    original = Trainer.step
+
+    def step(self):
+        values = original(self)
+        if self.iteration == 12:
+            self.avatar.color.last.bias.data[0] = float("inf")
+        return values
+
+    monkeypatch.setattr(Trainer, "step", step)
+    with pytest.raises(UserError, match="avatar.color.last.bias is not finite after iteration 12"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def altered(subject, folder, change):
+    """A copy of the subject whose poses went through ``change``."""
+    (folder / "fit").mkdir(parents=True)
+    for path in (subject / "fit").iterdir():
+        (folder / "fit" / path.name).write_bytes(path.read_bytes())
+    (folder / "ingest").symlink_to(subject / "ingest")
+    write_poses(folder / "fit" / "poses.parquet", change(read_poses(subject / "fit" / "poses.parquet")))
+    return context_for(folder, folder / "out")
+
+
+def without_last(poses: Poses) -> Poses:
+    return Poses(poses.frames[:-1], poses.rotation[:-1], poses.expression[:-1], poses.transl[:-1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_last, "no pose for frame 5"),
+        (lambda poses: dataclasses.replace(poses, transl=poses.transl * float("nan")), "finite"),
+        (lambda poses: dataclasses.replace(poses, transl=-poses.transl), "outside every frame"),
+    ],
+)
+def test_poses_that_cannot_be_used_say_what_to_do(subject, tmp_path, change, message):
+    with pytest.raises(UserError, match=message) as caught:
+        stage.run(altered(subject, tmp_path / "altered", change))
+    assert "fit" in str(caught.value)
+
+
+def test_masks_without_anybody_say_so(subject, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for frame in range(3):
+        write_mask(tmp_path / "masks", frame, np.zeros((64, 48), np.uint8))
+    with pytest.raises(UserError, match="nobody"):
+        stage.person_box(tmp_path, (0, 1, 2), 8)
+
+
+def test_person_box_holds_every_mask_and_stays_in_the_frame(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for frame, column in enumerate((3, 30)):
+        mask = np.zeros((64, 48), np.uint8)
+        mask[20:60, column : column + 10] = 255
+        write_mask(tmp_path / "masks", frame, mask)
+    box = stage.person_box(tmp_path, (0, 1), 8)
+    assert (box.left, box.top, box.right, box.bottom) == (0, 12, 48, 64)

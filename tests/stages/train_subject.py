@@ -1,0 +1,92 @@
+"""A subject small enough to train on in seconds: the open body in colour, six frames of 48 x 64."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from pipeline.avatar import Architecture, Avatar
+from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
+from pipeline.camera import facing_camera
+from pipeline.frames import write_frame, write_mask
+from pipeline.records import Split, write_cameras, write_split
+from pipeline.splat import render
+from stages.train.settings import TrainSettings
+
+BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
+FRAMES, WIDTH, HEIGHT = 6, 48, 64
+TINY = TrainSettings(
+    iterations=12,
+    held_out_every=6,
+    held_out_frames=1,
+    checkpoint_every=5,
+    plane_resolution=16,
+    plane_channels=4,
+    width=16,
+    groups=4,
+    subdivisions=0,
+    gate_frames=3,
+)
+
+
+def moving_poses(count: int = FRAMES) -> Poses:
+    """A head and shoulders 0.75 m away; the body turns and the head nods."""
+    rotation = torch.zeros(count, 55, 3)
+    phase = torch.linspace(-1, 1, count)
+    rotation[:, 0, 1] = 0.2 * phase
+    rotation[:, 15, 0] = 0.1 * phase
+    rotation[:, 16, 2] = -1.1
+    rotation[:, 17, 2] = 1.1
+    transl = torch.tensor([0.0, -0.44, -0.6]).expand(count, 3).clone()
+    return Poses(tuple(range(count)), rotation, torch.zeros(count, 5), transl)
+
+
+def write_subject(folder: Path) -> None:
+    """Writes ``ingest`` and ``fit`` as those stages would publish them."""
+    ingest, fit = folder / "ingest", folder / "fit"
+    for made in (ingest / "frames", ingest / "masks", fit):
+        made.mkdir(parents=True)
+    body, poses = load_body(BODY_FILE), moving_poses()
+    identity = mean_identity(body)
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    avatar = Avatar(body, identity, torch.arange(len(body.v_template)), bare).eval()
+    avatar.base_color.copy_(2 * torch.sin(9 * body.v_template))
+    camera = facing_camera(WIDTH, HEIGHT, 1.2 * HEIGHT)
+    for frame in poses.frames:
+        with torch.no_grad():
+            gaussians = avatar.gaussians(poses.rotation[frame], poses.expression[frame], poses.transl[frame])
+            rendering = render(gaussians, camera)
+        over_grey = rendering.color + (1 - rendering.alpha)[..., None] * 0.5
+        write_frame(ingest / "frames", frame, (over_grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+        write_mask(ingest / "masks", frame, (rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    write_cameras(ingest / "cameras.parquet", {frame: camera for frame in poses.frames})
+    write_split(ingest / "split.json", Split(train=poses.frames[:-1], test=poses.frames[-1:]))
+    write_identity(fit / "identity.safetensors", identity, body)
+    write_poses(fit / "poses.parquet", poses)
+
+
+def context_for(folder: Path, output: Path, work: Path | None = None, **changes):
+    """A stand-in for the runner's context; ``changes`` are settings."""
+    work = work or output.with_name(f"{output.name}-work")
+    output.mkdir(parents=True, exist_ok=True)
+    work.mkdir(parents=True, exist_ok=True)
+
+    @contextlib.contextmanager
+    def progress(total: int, label: str):
+        yield SimpleNamespace(advance=lambda n=1, note="": None)
+
+    return SimpleNamespace(
+        settings=dataclasses.replace(TINY, **changes),
+        inputs={"ingest": folder / "ingest", "fit": folder / "fit"},
+        body_file=BODY_FILE,
+        output=output,
+        work=work,
+        progress=progress,
+        log=lambda message: None,
+        timing=lambda name, value: None,
+    )

@@ -1,0 +1,60 @@
+"""What depends on the iteration alone, and the settings that set it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from stages.train import schedule
+from stages.train.settings import TrainSettings
+
+SETTINGS = TrainSettings(iterations=100, warm_up=10, final_rate=0.1)
+
+
+def test_rate_rises_then_falls_to_its_last_factor():
+    rates = [schedule.rate_factor(SETTINGS, iteration) for iteration in range(100)]
+    assert rates[0] == pytest.approx(0.1)
+    assert max(rates) == max(rates[9:12])
+    assert all(a > b for a, b in zip(rates[10:], rates[11:], strict=False))
+    assert rates[-1] == pytest.approx(0.1, abs=0.01)
+    assert rates[50] == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize(("fraction", "first"), [(0.0, 0), (0.4, 40), (1.0, None)])
+def test_fraction_of_the_run(fraction, first):
+    reached = [schedule.reached(SETTINGS, fraction, iteration) for iteration in range(100)]
+    assert reached == [first is not None and iteration >= first for iteration in range(100)]
+
+
+def test_every_frame_is_drawn_once_an_epoch_in_changing_order():
+    frames = (3, 5, 8, 13)
+    drawn = [schedule.drawn_frame(1, frames, position) for position in range(40)]
+    epochs = [tuple(drawn[start : start + 4]) for start in range(0, 40, 4)]
+    assert all(sorted(epoch) == list(frames) for epoch in epochs)
+    assert len(set(epochs)) > 1
+
+
+def test_draws_need_no_history():
+    frames = tuple(range(50))
+    forward = [schedule.drawn_frame(7, frames, position) for position in range(120)]
+    backward = [schedule.drawn_frame(7, frames, position) for position in reversed(range(120))]
+    assert forward == backward[::-1]
+    assert torch.equal(schedule.drawn_background(7, 5), schedule.drawn_background(7, 5))
+    assert not torch.equal(schedule.drawn_background(7, 5), schedule.drawn_background(7, 6))
+    assert forward != [schedule.drawn_frame(8, frames, position) for position in range(120)]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("iterations", 0),
+        ("subdivisions", 3),
+        ("groups", 7),
+        ("opacity", 1.0),
+        ("pose_heads_from", 1.5),
+        ("seed", -1),
+    ],
+)
+def test_impossible_setting_names_itself(field, value):
+    with pytest.raises(ValueError, match=f"train.{field}"):
+        dataclasses.replace(SETTINGS, **{field: value})
