@@ -194,7 +194,14 @@ class Avatar(nn.Module):
             color_logit=self.base_color[: len(features)] + color.float(),
         )
 
-    def pose(self, decoded: Decoded, rotation: Tensor, expression: Tensor, transl: Tensor) -> Posed:
+    def pose(
+        self,
+        decoded: Decoded,
+        rotation: Tensor,  # [55, 3]
+        expression: Tensor,  # [E]
+        transl: Tensor,  # [3]
+        noise: Tensor | None = None,  # [54 * 6]
+    ) -> Posed:
         """The Gaussians of one frame.
 
         Args:
@@ -202,6 +209,7 @@ class Avatar(nn.Module):
             rotation: [55, 3] rotation vectors, radians, the SMPL-X order of joints.
             expression: [E].
             transl: [3], metres.
+            noise: added to what the pose heads are told of the pose; for training.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
@@ -210,7 +218,9 @@ class Avatar(nn.Module):
         log_scale, color_logit, pose_offset = decoded.log_scale, decoded.color_logit, None
         if self.pose_heads_active:
             normals = _posed_normals(blended.detach(), shape.detach(), canonical.faces)
-            pose_offset, scale_change, color_change = self._pose_heads(decoded, rotation, normals)
+            theta = pose_features(rotation.detach())
+            theta = theta if noise is None else theta + noise
+            pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
         gaussians = Gaussians(
@@ -222,10 +232,9 @@ class Avatar(nn.Module):
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit)
 
-    def _pose_heads(self, decoded: Decoded, rotation: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
+    def _pose_heads(self, decoded: Decoded, theta: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
         """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
         features = decoded.features
-        theta = pose_features(rotation.detach())
         with self._autocast():
             geometry = self.pose_geometry(features, theta)
             color = self.pose_color(torch.cat([features, normals], 1), theta)

@@ -10,13 +10,13 @@ what their acceleration costs then drowns what the keypoints ask for (an elbow s
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
+from pipeline.threads import threads
 from stages.fit.objective import Objective
 from stages.fit.parameters import Parameters
 
@@ -62,22 +62,6 @@ def stepped(base: Parameters, steps: Parameters, bump: Tensor) -> Parameters:
     return Parameters(**moved)
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Within this, torch computes on one thread.
-
-    Equal input then gives equal bytes on any number of cores, gradients of indexing included. The
-    tensors are small: beside other jobs on two cores, a second thread made an iteration three times as
-    long, and drawing an overlay thirteen times.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def optimise(
     objective: Objective,
     initial: Parameters,
@@ -100,7 +84,7 @@ def optimise(
         FloatingPointError: the loss is not finite.
     """
     base = initial.detached()
-    with one_thread():
+    with threads(1):
         for begin, end, width in _phases(iterations):
             bump = bumps(objective.times, width)
             steps = base.zeros().leaves()

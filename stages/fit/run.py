@@ -24,7 +24,7 @@ from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
 from pipeline.records import read_cameras, read_footage
 from pipeline.stage import Context
-from stages.fit.optimise import one_thread
+from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
 from stages.fit.registration import Registration, register
 from stages.fit.residuals import group_means, write_residuals
@@ -34,7 +34,7 @@ _FPS = 25.0  # of the overlay, where the footage has no clock
 
 def run(context: Context) -> None:
     """Fit a clip and publish identity, poses, template, residuals and overlays."""
-    with one_thread():
+    with threads(1):
         _run(context)
 
 

@@ -165,7 +165,8 @@ class Trainer:
         background = schedule.drawn_background(settings.seed, position)
         view = self.views[frame]
         pose = self.poses(frame) if self._poses_move() else self.poses.fitted(frame)
-        posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl)
+        noise = self._pose_noise(position)
+        posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, noise)
         rendering = render(posed.gaussians, view.camera)
         image, target = losses.over(rendering.color, rendering.alpha, background), view.composite(background)
         terms = {
@@ -176,6 +177,10 @@ class Trainer:
         if settings.pose_change and self._poses_move():
             terms["pose_change"] = settings.pose_change * self.poses.change(frame)
         return terms
+
+    def _pose_noise(self, position: int) -> Tensor:
+        settings, length = self.settings, 6 * (self.poses.poses.rotation.shape[1] - 1)
+        return settings.pose_noise * schedule.drawn_noise(settings.seed, position, length)
 
     def _posed_terms(self, decoded: Decoded, posed: Posed) -> Terms:
         settings, neighbours, gaussians = self.settings, decoded.surface.neighbours, posed.gaussians

@@ -14,6 +14,7 @@ from pipeline.errors import UserError
 from pipeline.records import Split, read_cameras, read_split
 from pipeline.settings import as_dict
 from pipeline.stage import Context
+from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.data import Frames, person_box, spread
 from stages.train.loop import Trainer, describe, point_values
@@ -51,6 +52,12 @@ def run(context: Context) -> None:
     Raises:
         UserError: if the inputs do not go together, or training diverges.
     """
+    with threads(context.settings.threads):
+        train_subject(context)
+
+
+def train_subject(context: Context) -> None:
+    """Reads the inputs, trains, and writes what is published."""
     inputs, settings = read_inputs(context), context.settings
     refinement = PoseRefinement(inputs.poses, inputs.split.train)
     started = time.monotonic()

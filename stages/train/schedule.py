@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.train.settings import TrainSettings
 
-FRAMES, BACKGROUND = 1, 2  # purposes
+FRAMES, BACKGROUND, POSE_NOISE = 1, 2, 3  # purposes
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
@@ -45,3 +45,9 @@ def _order(seed: int, count: int, epoch: int) -> np.ndarray:
 def drawn_background(seed: int, position: int) -> Tensor:
     """A uniformly random colour, [3]."""
     return torch.from_numpy(np.random.default_rng([seed, BACKGROUND, position]).random(3, np.float32))
+
+
+def drawn_noise(seed: int, position: int, size: int) -> Tensor:
+    """Standard normal numbers, [size]."""
+    draws = np.random.default_rng([seed, POSE_NOISE, position]).standard_normal(size, np.float32)
+    return torch.from_numpy(draws)

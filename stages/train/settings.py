@@ -18,10 +18,11 @@ class TrainSettings:
     held_out_every: int = 250  # iterations between points of the held-out curve
     held_out_frames: int = 3  # frames of each such point
     checkpoint_every: int = 250  # iterations between checkpoints
+    threads: int = 1  # of the CPU, 0 for all; on 2 cores one is faster at this size (docs/results.md)
 
     # Representation
     subdivisions: int = 1  # levels of midpoint subdivision: 0, 1 or 2
-    subdivide_from: float = 0.4  # fraction of the run before which the mesh stays unsubdivided
+    subdivide_from: float = 0.5  # fraction of the run before which the mesh stays unsubdivided
     plane_resolution: int = 128  # texels along a side of each plane
     plane_channels: int = 32  # features a texel
     width: int = 128  # hidden channels of the heads
@@ -32,6 +33,8 @@ class TrainSettings:
     thickness: float = 0.5  # initial standard deviation along the normal, in those along the surface
     opacity: float = 0.999  # of every Gaussian
     pose_heads_from: float = 0.4  # fraction of the run from which the pose heads take part; 1: never
+    # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
+    pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices
     initial_color: bool = True  # colours start at what the training frames show, else at grey
 
     # Visibility gate
@@ -65,7 +68,16 @@ class TrainSettings:
         """Refuses values that cannot work."""
         counts = ("iterations", "batch", "held_out_every", "checkpoint_every", "gate_frames", "groups")
         fractions = ("subdivide_from", "pose_heads_from", "refine_from", "final_rate")
-        amounts = ("held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "seed")
+        amounts = (
+            "held_out_frames",
+            "gate_rings",
+            "warm_up",
+            "crop_margin",
+            "learning_rate",
+            "seed",
+            "pose_noise",
+            "threads",
+        )
         self._require(counts, lambda value: value >= 1, "be at least 1")
         self._require(fractions, lambda value: 0 <= value <= 1, "lie between 0 and 1")
         self._require(amounts, lambda value: value >= 0, "not be negative")

@@ -188,6 +188,17 @@ def test_head_and_hands_are_not_moved_by_pose_heads(body, identity):
     assert moved[~still].min() > 0
 
 
+def test_noise_reaches_the_pose_heads_alone(avatar):
+    awakened(avatar)
+    decoded, noise = avatar.decode(), 0.3 * torch.ones(54 * 6)
+    plain, noisy = avatar.pose(decoded, *a_pose()), avatar.pose(decoded, *a_pose(), noise)
+    assert not torch.equal(plain.color_logit, noisy.color_logit)
+    avatar.pose_heads_active = False
+    plain, noisy = avatar.pose(decoded, *a_pose()), avatar.pose(decoded, *a_pose(), noise)
+    assert torch.equal(plain.gaussians.means, noisy.gaussians.means)
+    assert torch.equal(plain.color_logit, noisy.color_logit)
+
+
 def test_only_the_head_kept_needs_one_region(body, identity, avatar):
     head = build_canonical(body, identity, 0).is_part("head", "face")
     alone = Avatar(body, identity, torch.nonzero(head)[:, 0], dataclasses.replace(SMALL, subdivisions=0))

@@ -64,10 +64,7 @@ def test_sets_are_complete_and_index_the_body(body, landmarks):
 
 def test_left_mirrors_right(places):
     pairs = {
-        "whole_body": COCO_BODY
-        + [17 + k for k in FEET]
-        + [23 + k for k in IBUG]
-        + [91 + k for k in HANDS],
+        "whole_body": COCO_BODY + [17 + k for k in FEET] + [23 + k for k in IBUG] + [91 + k for k in HANDS],
         "pose": MEDIAPIPE_POSE,
         "hands": HANDS,
     }

@@ -41,6 +41,8 @@ def test_draws_need_no_history():
     assert forward == backward[::-1]
     assert torch.equal(schedule.drawn_background(7, 5), schedule.drawn_background(7, 5))
     assert not torch.equal(schedule.drawn_background(7, 5), schedule.drawn_background(7, 6))
+    assert torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 5, 9))
+    assert not torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 6, 9))
     assert forward != [schedule.drawn_frame(8, frames, position) for position in range(120)]
 
 

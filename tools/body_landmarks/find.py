@@ -33,9 +33,7 @@ def find_landmarks(body: BodyModel, canonical: np.ndarray, ibug: np.ndarray | No
     finder = _Finder(body)
     face_mesh = finder.face_mesh(canonical, ibug)
     hands = join(*(finder.hand(side) for side in SIDES))
-    whole_body = join(
-        finder.coco_body(face_mesh), finder.feet(), face_mesh[list(IBUG_OF_FACE_MESH)], hands
-    )
+    whole_body = join(finder.coco_body(face_mesh), finder.feet(), face_mesh[list(IBUG_OF_FACE_MESH)], hands)
     return Landmarks(whole_body, finder.pose(face_mesh), hands, face_mesh)
 
 

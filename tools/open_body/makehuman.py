@@ -94,7 +94,7 @@ def triangulated(mesh: BaseMesh, groups: Sequence[str]) -> Surface:
 
 def read_target(path: Path, count: int) -> np.ndarray:
     """A morph target, gzipped or not: [count, 3] float32 displacements, metres."""
-    with (gzip.open(path, "rt") if path.suffix == ".gz" else path.open()) as file:
+    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
         numbers = [line for line in file if line.strip() and not line.startswith("#")]
     rows = np.array(" ".join(numbers).split(), dtype=np.float64).reshape(-1, 4)
     displacements = np.zeros((count, 3), np.float32)

@@ -1,0 +1,24 @@
+"""How many threads a stage's arithmetic takes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Within this, torch and the rasterizer compute on ``count`` threads; 0 leaves them as they are.
+
+    At the sizes of a quick run one thread is the fastest: its tensors are small, and two pools of
+    threads (torch's and numba's) spin beside each other on two cores. With one thread equal input also
+    gives equal bytes on any number of cores, gradients of indexing included.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
