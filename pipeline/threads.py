@@ -12,9 +12,8 @@ import torch
 def threads(count: int) -> Iterator[None]:
     """Within this, torch and the rasterizer compute on ``count`` threads; 0 leaves them as they are.
 
-    At the sizes of a quick run one thread is the fastest: its tensors are small, and two pools of
-    threads (torch's and numba's) spin beside each other on two cores. With one thread equal input also
-    gives equal bytes on any number of cores, gradients of indexing included.
+    At the sizes of a quick run one thread was faster than two on two cores (docs/results.md). With one
+    thread equal input also gives equal bytes on any number of cores, gradients of indexing included.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
