@@ -19,6 +19,7 @@ from pipeline.body.skinning import (
     blend_transforms,
     joint_orientations,
     joint_transforms,
+    matrix_transforms,
     pose_body,
     pose_offsets,
     posed_joints,
@@ -29,8 +30,8 @@ from pipeline.body.subdivision import subdivide
 __all__ = [
     "JOINT_NAMES", "PARTS", "BodyModel", "Identity", "Landmarks", "PointSet", "Poses", "blend_transforms",
     "draw_mesh", "edges", "expression_offsets", "is_face", "is_part", "joint_index", "joint_orientations",
-    "joint_transforms", "load_body", "load_landmarks", "locate", "mean_identity", "part_labels", "pose_body",
-    "pose_offsets", "posed_joints", "rasterize", "read_identity", "read_poses", "rest_joints",
-    "rest_vertices", "skin", "subdivide", "uniform_laplacian", "vertex_normals", "write_identity",
-    "write_poses",
+    "joint_transforms", "load_body", "load_landmarks", "locate", "matrix_transforms", "mean_identity",
+    "part_labels", "pose_body", "pose_offsets", "posed_joints", "rasterize", "read_identity", "read_poses",
+    "rest_joints", "rest_vertices", "skin", "subdivide", "uniform_laplacian", "vertex_normals",
+    "write_identity", "write_poses",
 ]  # fmt: skip

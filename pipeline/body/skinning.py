@@ -33,9 +33,22 @@ def joint_transforms(
     Returns:
         [T, 55, 3, 4], ``[R | t]`` with the rest pose removed: the identity at zero rotation.
     """
-    orientation, position = _forward_kinematics(rotation, joints, parents)
+    return matrix_transforms(roma.rotvec_to_rotmat(rotation), joints, parents)[0]
+
+
+def matrix_transforms(
+    matrices: Tensor,  # [T, 55, 3, 3]
+    joints: Tensor,  # [55, 3]
+    parents: tuple[int, ...],
+) -> tuple[Tensor, Tensor]:
+    """``joint_transforms`` and ``posed_joints`` of local rotation matrices.
+
+    Returns:
+        A_j, [T, 55, 3, 4], and the posed joints, [T, 55, 3], metres.
+    """
+    orientation, position = _forward_kinematics(matrices, joints, parents)
     translation = position - (orientation @ joints[..., None])[..., 0]
-    return torch.cat([orientation, translation[..., None]], dim=-1)
+    return torch.cat([orientation, translation[..., None]], dim=-1), position
 
 
 def posed_joints(
@@ -44,12 +57,13 @@ def posed_joints(
     parents: tuple[int, ...],
 ) -> Tensor:
     """Where the joints are in a pose, without ``transl``: [T, 55, 3], metres."""
-    return _forward_kinematics(rotation, joints, parents)[1]
+    return _forward_kinematics(roma.rotvec_to_rotmat(rotation), joints, parents)[1]
 
 
 def joint_orientations(rotation: Tensor, parents: tuple[int, ...]) -> Tensor:
     """Each joint's rotation in the world: [T, 55, 3] rotation vectors -> [T, 55, 3, 3]."""
-    return _forward_kinematics(rotation, rotation.new_zeros(len(parents), 3), parents)[0]
+    matrices = roma.rotvec_to_rotmat(rotation)
+    return _forward_kinematics(matrices, rotation.new_zeros(len(parents), 3), parents)[0]
 
 
 def skin(
@@ -109,21 +123,18 @@ def pose_body(
     correctives = pose_offsets(body, rotation)
     if correctives is not None:
         rest = rest + correctives
-    orientation, posed = _forward_kinematics(rotation, joints, body.parents)
-    translation = posed - (orientation @ joints[..., None])[..., 0]
-    transforms = torch.cat([orientation, translation[..., None]], dim=-1)
+    transforms, posed = matrix_transforms(roma.rotvec_to_rotmat(rotation), joints, body.parents)
     vertices = skin(transforms, body.skinning_weights, rest)
     return vertices + transl[..., None, :], posed + transl[..., None, :]
 
 
-def _forward_kinematics(rotation: Tensor, joints: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """World orientation [T, 55, 3, 3] and position [T, 55, 3] of every joint.
+def _forward_kinematics(local: Tensor, joints: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """World orientation [T, 55, 3, 3] and position [T, 55, 3] of every joint, from local matrices.
 
     The tree is walked by depth, all joints of a depth at once: 11 steps instead of 55.
     """
     levels, places, order = _levels(parents)
-    local = roma.rotvec_to_rotmat(rotation)
-    root = joints[..., list(levels[0]), :].expand(*rotation.shape[:-2], -1, -1)
+    root = joints[..., list(levels[0]), :].expand(*local.shape[:-3], -1, -1)
     orientations, positions = [local[..., list(levels[0]), :, :]], [root]
     for level, place in zip(levels[1:], places, strict=True):
         above = orientations[-1][..., list(place), :, :]

@@ -5,9 +5,10 @@ from stages.fit.settings import FitSettings
 
 STAGE = Stage(
     name="fit",
-    version=1,
+    version=2,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={"ingest": ("keypoints.parquet", "cameras.parquet", "footage.json", "frames/*", "masks/*")},
     reads_body=True,
+    path_settings=("pose_init", "face_init", "flame_model"),
 )

@@ -43,7 +43,7 @@ def initial_parameters(
     rotation[:, 0] = torso_orientation(keypoints, observations, views)
     sizes = model.shape.shape[2], model.expression.shape[2], model.face.shape[1]
     parameters = parameters_of(rotation, torch.zeros(count, 3), sizes)
-    points, _ = model.posed(parameters, rotation)
+    points, _ = model.posed(parameters, parameters.matrices)
     transl = weak_perspective(points, observations, views)
     return parameters_of(rotation, transl, sizes)
 

@@ -22,6 +22,7 @@ from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
 from stages.fit.ranges import joint_ranges
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views
+from stages.fit.windows import Window, windows
 
 LONG_SIDE = 512.0
 _CHEST_DISTANCE = 0.22  # metres; a hand seen before the torso is nearer than the shoulders by this
@@ -39,13 +40,13 @@ class Prediction:
     """What parameters say about a clip.
 
     Attributes:
-        rotation: [T, 55, 3], with the joints that nothing was seen of at their initial rotation.
+        matrices: [T, 55, 3, 3], with the joints that nothing was seen of at their initial rotation.
         joints: [T, 55, 3], in the world.
         in_camera: [T, N, 3], landmarks in the camera's axes.
         pixels: [T, N, 2].
     """
 
-    rotation: Tensor
+    matrices: Tensor
     joints: Tensor
     in_camera: Tensor
     pixels: Tensor
@@ -67,14 +68,15 @@ class Objective:
         """Prepare what does not change during the optimisation."""
         self.observations, self.model, self.views = observations, model, views
         self.settings, self.initial = settings, initial
-        self.initial_rotation = initial.rotation
-        self.movable = movable[:, None]
+        self.start = initial.matrices
+        self.movable = movable[:, None, None]
         self.weight = observations.mask * observations.weight
         self.saturation = torch.tensor(_SATURATION)[observations.group]
         self.scale = (LONG_SIDE / views.size.amax(1))[:, None, None]
         self.times = (observations.frames - observations.frames[0]).float()
         names = [body.joint_names[j] for j in range(BODY_POSE.start, BODY_POSE.stop)]
         self.ranges = joint_ranges()
+        self.looked_at = torch.unique(torch.cat([self.ranges.joint, torch.arange(JAW, HANDS.start)]))
         self.stiffness = torch.tensor([_STIFFNESS.get(name, 0.3) for name in names])
         kinds = (observations.limbs, observations.hand_bones)
         self.bones = [(bones, *_picks(bones, len(observations.group))) for bones in kinds]
@@ -83,79 +85,110 @@ class Objective:
         self.mirror_face = mirror_matrix(model.rest[self.face])
         self.mirror_joints = mirror_matrix(rest_joints(body, mean_identity(body)))
 
-    def predict(self, parameters: Parameters) -> Prediction:
-        """Pose and project the landmarks."""
-        rotation = torch.where(self.movable, parameters.rotation, self.initial_rotation)
-        points, joints = self.model.posed(parameters, rotation)
-        in_camera = self.views.to_camera(points)
-        return Prediction(rotation, joints, in_camera, self.views.to_pixels(in_camera))
+    @property
+    def whole(self) -> Window:
+        """The window of all frames."""
+        return windows(len(self.times), len(self.times))[0]
 
-    def __call__(self, parameters: Parameters, robust: bool) -> dict[str, Tensor]:
+    def predict(self, parameters: Parameters, window: Window) -> Prediction:
+        """Pose and project the landmarks of a window's frames."""
+        matrices = torch.where(self.movable, parameters.matrices, self.start[window.posed])
+        points, joints = self.model.posed(parameters, matrices)
+        views = self.views.rows(window.posed)
+        in_camera = views.to_camera(points)
+        return Prediction(matrices, joints, in_camera, views.to_pixels(in_camera))
+
+    def __call__(
+        self, parameters: Parameters, robust: bool, window: Window | None = None
+    ) -> dict[str, Tensor]:
         """The weighted terms of Eq. 1, each a number; their sum is the loss.
 
         Args:
-            parameters: the unknowns.
+            parameters: the unknowns, of the window's posed frames.
             robust: let the error of a point saturate; at the start every point pulls in proportion.
+            window: the frames that count; all by default. The losses of windows that cover the clip
+                add up to the clip's.
         """
-        predicted = self.predict(parameters)
+        window = self.whole if window is None else window
+        predicted = self.predict(parameters, window)
+        share = (window.end - window.begin) / len(self.times)
+        settings = self.settings
         return {
-            "keypoints": self._keypoints(predicted, robust),
-            "directions": self._directions(predicted),
-            "in_front": self._in_front(predicted),
-            "init": self.settings.lambda_init * self._init(parameters, predicted.rotation),
-            "sreg": self.settings.lambda_sreg * self._sreg(parameters),
-            "smooth": self.settings.smoothness * self._smooth(parameters, predicted),
+            "keypoints": self._mean(self._keypoints(predicted, robust, window), window),
+            "directions": self._mean(self._directions(predicted, window), window),
+            "in_front": self._mean(self._in_front(predicted, window), window),
+            "init": settings.lambda_init * self._mean(self._init(parameters, predicted, window), window),
+            "sreg": share * settings.lambda_sreg * self._sreg(parameters),
+            "smooth": settings.smoothness * self._smooth(parameters, predicted, window),
         }
 
     def residuals(self, parameters: Parameters) -> Tensor:
         """Reprojection errors, [T, N], pixels of the stored frames; NaN where masked."""
+        parts = []
         with torch.no_grad():
-            error = (self.predict(parameters).pixels - self.observations.pixels).norm(dim=-1)
+            for window in windows(len(self.times), self.settings.minibatch):
+                predicted = self.predict(parameters.rows(window.low, window.high), window)
+                error = (predicted.pixels - self.observations.pixels[window.posed]).norm(dim=-1)
+                parts.append(error[window.own])
+        error = torch.cat(parts)
         return torch.where(self.observations.mask, error, torch.full_like(error, torch.nan))
 
-    def _keypoints(self, predicted: Prediction, robust: bool) -> Tensor:
-        pixels, target = predicted.pixels * self.scale, self.observations.pixels * self.scale
-        saturation = self.saturation if robust else None
-        error = terms.keypoint_loss(pixels, target, self.observations.mask, saturation)
-        return (error * self.weight).sum(1).mean() / 8
+    def _mean(self, of_frames: Tensor, window: Window) -> Tensor:
+        """What a window's own frames add to the mean over the clip: [W] -> a number."""
+        return of_frames[window.own].sum() / len(self.times)
 
-    def _directions(self, predicted: Prediction) -> Tensor:
-        total = predicted.pixels.new_zeros(())
+    def _keypoints(self, predicted: Prediction, robust: bool, window: Window) -> Tensor:
+        seen, scale = self.observations, self.scale[window.posed]
+        pixels, target = predicted.pixels * scale, seen.pixels[window.posed] * scale
+        error = terms.keypoint_loss(
+            pixels, target, seen.mask[window.posed], self.saturation if robust else None
+        )
+        return (error * self.weight[window.posed]).sum(1) / 8
+
+    def _directions(self, predicted: Prediction, window: Window) -> Tensor:
+        total = predicted.pixels.new_zeros(len(predicted.pixels))
         for bones, start, end in self.bones:
-            loss = terms.direction_loss(start @ predicted.in_camera, end @ predicted.in_camera, bones.unit)
-            total = total + (loss * bones.weight).sum(1).mean()
+            unit, weight = bones.unit[window.posed], bones.weight[window.posed]
+            loss = terms.direction_loss(start @ predicted.in_camera, end @ predicted.in_camera, unit)
+            total = total + (loss * weight).sum(1)
         return total
 
-    def _in_front(self, predicted: Prediction) -> Tensor:
+    def _in_front(self, predicted: Prediction, window: Window) -> Tensor:
         """Hands seen before a chest that faces the camera are in front of it."""
         shoulders = predicted.pixels[:, self.shoulders].detach()
         left, right = shoulders[:, :1, 0], shoulders[:, 1:, 0]
-        pixels, margin = predicted.pixels.detach(), 5 / self.scale[..., 0]
+        pixels, margin = predicted.pixels.detach(), 5 / self.scale[window.posed][..., 0]
         over = (pixels[..., 0] > right - margin) & (pixels[..., 0] < left + margin)
         over = over & (pixels[..., 1] > shoulders[..., 1].mean(1, keepdim=True))
-        over = over & self.observations.mask & self.observations.hands
+        over = over & self.observations.mask[window.posed] & self.observations.hands
         depth = predicted.in_camera[..., 2]
         chest = (depth[:, self.shoulders[0]] + depth[:, self.shoulders[1]]) / 2
-        return 20 * (terms.in_front_loss(depth, chest, _CHEST_DISTANCE) * over).sum(1).mean()
+        return 20 * (terms.in_front_loss(depth, chest, _CHEST_DISTANCE) * over).sum(1)
 
-    def _init(self, parameters: Parameters, rotation: Tensor) -> Tensor:
-        """L_init and the priors on single joints."""
-        start = self.initial_rotation
-        pose = terms.initial_loss(rotation[:, BODY_POSE], start[:, BODY_POSE]).sum(-1) * self.stiffness
-        hands = terms.initial_loss(rotation[:, HANDS], start[:, HANDS])
-        expression = terms.initial_loss(parameters.expression, self.initial.expression)
-        eyes, jaw = rotation[:, EYES].square(), rotation[:, JAW].square()
+    def _init(self, parameters: Parameters, predicted: Prediction, window: Window) -> Tensor:
+        """L_init, Eq. 3, and the priors on single joints."""
+        matrices, start = predicted.matrices, self.start[window.posed]
+        pose = terms.rotation_loss(matrices[:, BODY_POSE], start[:, BODY_POSE]) * self.stiffness
+        hands = terms.rotation_loss(matrices[:, HANDS], start[:, HANDS])
+        expression = terms.initial_loss(parameters.expression, self.initial.expression[window.posed])
+        vectors = self._vectors(matrices)
+        eyes, jaw = vectors[:, EYES].square(), vectors[:, JAW].square()
         ranges = self.ranges
-        outside = terms.range_loss(ranges.of(rotation), ranges.low, ranges.high)
+        outside = terms.range_loss(ranges.of(vectors), ranges.low, ranges.high)
         return (
-            0.4 * pose.sum(1).mean()
-            + 0.045 * hands.sum((1, 2)).mean()
-            + 0.05 * expression.sum(1).mean()
-            + 20 * jaw[:, 1:].sum(1).mean()
-            + 0.5 * eyes.sum((1, 2)).mean()
-            + 20 * eyes[..., 2].sum(1).mean()
-            + 5 * outside.sum(1).mean()
+            4 * pose.sum(1)
+            + 0.45 * hands.sum(1)
+            + 0.5 * expression.sum(1)
+            + 200 * jaw[:, 1:].sum(1)
+            + 5 * eyes.sum((1, 2))
+            + 200 * eyes[..., 2].sum(1)
+            + 50 * outside.sum(1)
         )
+
+    def _vectors(self, matrices: Tensor) -> Tensor:
+        """Rotation vectors of the joints that a prior looks at, zero for the others: [W, 55, 3]."""
+        vectors = roma.rotmat_to_rotvec(matrices[:, self.looked_at])
+        return vectors.new_zeros(len(matrices), 55, 3).index_copy(1, self.looked_at, vectors)
 
     def _sreg(self, parameters: Parameters) -> Tensor:
         """L_sreg, Eq. 5, and the length of the face offsets."""
@@ -168,18 +201,19 @@ class Objective:
             + 500 * terms.symmetry_loss(face_offset, self.mirror_face).sum()
         )
 
-    def _smooth(self, parameters: Parameters, predicted: Prediction) -> Tensor:
+    def _smooth(self, parameters: Parameters, predicted: Prediction, window: Window) -> Tensor:
         """Accelerations of joints and place, and a little velocity of everything."""
-        count = len(self.times)
-        placed = terms.acceleration(predicted.joints - parameters.transl[:, None], self.times).square()
-        moved = terms.acceleration(parameters.transl, self.times).square()
-        total = 200 * (placed.sum() + moved.sum()) / count
-        matrices = roma.rotvec_to_rotmat(predicted.rotation)
-        turned = terms.velocity(matrices, self.times).square().sum((2, 3)) / 2  # about the squared angle
+        times, own, transl = self.times[window.posed], window.differences, parameters.transl
+        placed = terms.acceleration(predicted.joints - transl[:, None], times)[own].square()
+        moved = terms.acceleration(transl, times)[own].square()
+        turned = (
+            terms.velocity(predicted.matrices, times)[own].square().sum((2, 3)) / 2
+        )  # squared angle, nearly
         joints = turned.new_full((55,), 1.0)
         joints[0], joints[BODY_POSE], joints[JAW], joints[EYES] = 10.0, 3.0, 2.0, 0.5
-        changed = terms.velocity(parameters.expression, self.times).square()
-        return total + ((turned * joints).sum() + 0.05 * changed.sum()) / count
+        changed = terms.velocity(parameters.expression, times)[own].square()
+        total = 200 * (placed.sum() + moved.sum()) + (turned * joints).sum() + 0.05 * changed.sum()
+        return total / len(self.times)
 
 
 def _picks(bones: Directions, count: int) -> tuple[Tensor, Tensor]:

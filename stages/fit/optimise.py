@@ -10,6 +10,7 @@ what their acceleration costs then drowns what the keypoints ask for (an elbow s
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 
@@ -18,7 +19,8 @@ from torch import Tensor
 
 from pipeline.threads import threads
 from stages.fit.objective import Objective
-from stages.fit.parameters import Parameters
+from stages.fit.parameters import PER_FRAME, Parameters
+from stages.fit.windows import Window, bumps, windows
 
 RATES = {
     "betas": 0.02, "global_orient": 0.02, "body_pose": 0.02, "jaw": 0.02, "eyes": 0.01, "hands": 0.03,
@@ -27,7 +29,6 @@ RATES = {
 """Adam's step for each group of parameters: radians, metres or units of the coefficients."""
 
 ROOT_UNTIL, OFFSETS_FROM, ROBUST_FROM = 0.15, 0.4, 0.3
-PER_FRAME = ("global_orient", "body_pose", "jaw", "eyes", "hands", "expression", "transl")
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 """From which share of the iterations on steps have which width in time: standard deviation in frames."""
 
@@ -45,21 +46,58 @@ def rate(name: str, done: float, frozen: frozenset[str] = frozenset()) -> float:
     return RATES[name] * share
 
 
-def bumps(times: Tensor, width: float) -> Tensor:
-    """What a step of each frame moves of every frame: [T], in frames -> [T, T], rows sum to 1."""
-    if width == 0:
-        return torch.eye(len(times))
-    weight = torch.exp(-(times[:, None] - times).square() / (2 * width**2))
-    return weight / weight.sum(1, keepdim=True)
+def stepped(
+    base: Parameters, steps: Parameters, times: Tensor, width: float, window: Window
+) -> tuple[Parameters, dict[str, Tensor]]:
+    """A window's parameters after steps: ``base`` plus the steps spread in time.
 
+    Args:
+        base, steps: of the whole clip.
+        times: [T], in frames.
+        width: of the bumps that spread the steps, in frames.
+        window: the frames that are posed.
 
-def stepped(base: Parameters, steps: Parameters, bump: Tensor) -> Parameters:
-    """Parameters after steps: ``base`` plus steps spread in time by ``bump`` where there is a time."""
-    moved = {}
+    Returns:
+        The parameters of the posed frames, and copies of the steps that they depend on, by name, which
+        collect the gradients.
+    """
+    bump, first, last = bumps(times, width, window.low, window.high)
+    moved, leaves = {}, {}
     for name, value in base.named().items():
         step = getattr(steps, name)
-        moved[name] = value + ((bump @ step.flatten(1)).view_as(step) if name in PER_FRAME else step)
-    return Parameters(**moved)
+        leaf = (step[first:last] if name in PER_FRAME else step).detach().requires_grad_()
+        leaves[name] = leaf
+        if name in PER_FRAME:
+            moved[name] = value[window.posed] + (bump @ leaf.flatten(1)).unflatten(1, leaf.shape[1:])
+        else:
+            moved[name] = value + leaf
+    return Parameters(**moved), leaves
+
+
+def gradients(
+    objective: Objective,
+    base: Parameters,
+    steps: Parameters,
+    width: float,
+    size: int,
+    robust: bool,
+    step: int,
+) -> float:
+    """Leave the gradient of the clip's loss in ``steps``, window by window; returns the loss."""
+    total, times = 0.0, objective.times
+    for leaf in steps.named().values():
+        leaf.grad = torch.zeros_like(leaf)
+    for window in windows(len(times), size):
+        parameters, leaves = stepped(base, steps, times, width, window)
+        loss = finite_sum(objective(parameters, robust, window), step)
+        loss.backward()
+        total += float(loss.detach())
+        _, first, last = bumps(times, width, window.low, window.high)
+        for name, leaf in leaves.items():
+            if leaf.grad is not None:
+                whole = getattr(steps, name).grad
+                (whole[first:last] if name in PER_FRAME else whole).add_(leaf.grad)
+    return total
 
 
 def optimise(
@@ -68,6 +106,7 @@ def optimise(
     iterations: int,
     frozen: frozenset[str] = frozenset(),
     learning_rate: float = 1.0,
+    minibatch: int = 256,
     report: Callable[[str], None] = lambda note: None,
 ) -> Parameters:
     """Fit a clip.
@@ -78,6 +117,7 @@ def optimise(
         iterations: steps.
         frozen: names of groups of parameters that stay as they are.
         learning_rate: factor on every step.
+        minibatch: frames that are posed at a time, which bounds the memory and changes nothing else.
         report: called after each step with a note on the loss.
 
     Raises:
@@ -86,21 +126,28 @@ def optimise(
     base = initial.detached()
     with threads(1):
         for begin, end, width in _phases(iterations):
-            bump = bumps(objective.times, width)
-            steps = base.zeros().leaves()
+            steps = base.zeros()
             groups = [{"params": [leaf], "name": name} for name, leaf in steps.named().items()]
             adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
             for step in range(begin, end):
                 done = step / iterations
                 for group in adam.param_groups:
                     group["lr"] = learning_rate * rate(group["name"], done, frozen)
-                total = finite_sum(objective(stepped(base, steps, bump), robust=done > ROBUST_FROM), step)
-                adam.zero_grad()
-                total.backward()
+                loss = gradients(objective, base, steps, width, minibatch, done > ROBUST_FROM, step)
                 adam.step()
-                report(f"loss {float(total.detach()):.3f}")
-            base = stepped(base, steps, bump).detached()
+                report(f"loss {loss:.3f}")
+            base = _moved(base, steps, objective.times, width, minibatch)
     return base
+
+
+def _moved(base: Parameters, steps: Parameters, times: Tensor, width: float, size: int) -> Parameters:
+    """The whole clip's parameters after steps, window by window."""
+    parts = []
+    for window in windows(len(times), size):
+        parameters = stepped(base, steps, times, width, window)[0].detached()
+        parts.append(parameters.rows(window.own.start, window.own.stop))
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in PER_FRAME}
+    return dataclasses.replace(parts[0], **joined).orthonormal()
 
 
 def finite_sum(losses: Mapping[str, Tensor], step: int) -> Tensor:

@@ -11,27 +11,33 @@ from __future__ import annotations
 
 import dataclasses
 
+import roma
 import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from pipeline.body import BodyModel, joint_transforms, mean_identity, rest_joints, skin
+from pipeline.body import BodyModel, matrix_transforms, mean_identity, rest_joints, skin
 from pipeline.body.joints import BODY_POSE, GLOBAL_ORIENT, JAW
 from pipeline.body.landmarks import PointSet
 
 EYES, HANDS = slice(23, 25), slice(25, 55)
+ROTATIONS = ("global_orient", "body_pose", "jaw", "eyes", "hands")
+PER_FRAME = (*ROTATIONS, "expression", "transl")
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
     """The unknowns of a clip of T frames: leaves of the optimisation.
 
+    Rotations are six numbers each, the first two columns of a matrix before orthonormalisation: unlike
+    angles they have no seam that a turning body would have to cross (Zhou et al. 2019).
+
     Attributes:
-        global_orient: [T, 1, 3], radians, as are the next four.
-        body_pose: [T, 21, 3].
-        jaw: [T, 1, 3].
-        eyes: [T, 2, 3].
-        hands: [T, 30, 3].
+        global_orient: [T, 1, 6], as are the next four.
+        body_pose: [T, 21, 6].
+        jaw: [T, 1, 6].
+        eyes: [T, 2, 6].
+        hands: [T, 30, 6].
         expression: psi, [T, E].
         transl: [T, 3], metres.
         betas: beta, [B].
@@ -51,9 +57,18 @@ class Parameters:
     face_control: Tensor
 
     @property
-    def rotation(self) -> Tensor:
-        """Theta, [T, 55, 3], rotation vectors in the order of the schema."""
-        return torch.cat([self.global_orient, self.body_pose, self.jaw, self.eyes, self.hands], dim=1)
+    def matrices(self) -> Tensor:
+        """Theta, [T, 55, 3, 3], rotation matrices relative to the parent, in the order of the schema."""
+        six = torch.cat([getattr(self, name) for name in ROTATIONS], dim=1)
+        return roma.special_gramschmidt(six.unflatten(-1, (3, 2)))
+
+    def orthonormal(self) -> Parameters:
+        """The same rotations with unit and orthogonal columns."""
+        return dataclasses.replace(self, **_rotation_groups(self.matrices))
+
+    def rows(self, low: int, high: int) -> Parameters:
+        """The frames from ``low`` to ``high`` - 1; what all frames share stays as it is."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[low:high] for name in PER_FRAME})
 
     def named(self) -> dict[str, Tensor]:
         """Every tensor by its name."""
@@ -77,16 +92,24 @@ def parameters_of(rotation: Tensor, transl: Tensor, sizes: tuple[int, int, int])
     """Parameters with a pose and a place, everything else zero.
 
     Args:
-        rotation: [T, 55, 3].
+        rotation: [T, 55, 3], rotation vectors.
         transl: [T, 3].
         sizes: the numbers of betas, expressions and face controls.
     """
     betas, expressions, controls = sizes
     new = rotation.new_zeros
     return Parameters(
-        rotation[:, GLOBAL_ORIENT], rotation[:, BODY_POSE], rotation[:, JAW : JAW + 1], rotation[:, EYES],
-        rotation[:, HANDS], new(len(rotation), expressions), transl, new(betas), new(55, 3), new(controls, 3),
+        **_rotation_groups(roma.rotvec_to_rotmat(rotation)),
+        expression=new(len(rotation), expressions), transl=transl, betas=new(betas),
+        joint_offset=new(55, 3), face_control=new(controls, 3),
     )  # fmt: skip
+
+
+def _rotation_groups(matrices: Tensor) -> dict[str, Tensor]:
+    """[T, 55, 3, 3] as the six numbers of each rotation, by group."""
+    six = matrices[..., :2].flatten(-2)
+    parts = (GLOBAL_ORIENT, BODY_POSE, slice(JAW, JAW + 1), EYES, HANDS)
+    return {name: six[:, part] for name, part in zip(ROTATIONS, parts, strict=True)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,16 +136,20 @@ class LandmarkModel:
     joint_shape: Tensor
     parents: tuple[int, ...]
 
-    def posed(self, parameters: Parameters, rotation: Tensor) -> tuple[Tensor, Tensor]:
-        """Landmarks [T, N, 3] and joints [T, 55, 3] in the world, metres."""
+    def posed(self, parameters: Parameters, matrices: Tensor) -> tuple[Tensor, Tensor]:
+        """Landmarks [T, N, 3] and joints [T, 55, 3] in the world, metres.
+
+        Args:
+            parameters: everything but the pose is read from there.
+            matrices: theta, [T, 55, 3, 3].
+        """
         rest = self.rest + self.shape @ parameters.betas + self.joint @ parameters.joint_offset
         rest = rest + self.face @ parameters.face_control
         flat = self.expression.flatten(0, 1)
         points = rest + (parameters.expression @ flat.mT).unflatten(1, self.rest.shape)
         joints = self.joints + self.joint_shape @ parameters.betas + parameters.joint_offset
-        transforms = joint_transforms(rotation, joints, self.parents)
+        transforms, moved = matrix_transforms(matrices, joints, self.parents)
         place = parameters.transl[:, None]
-        moved = (transforms[..., :3] @ joints[..., None])[..., 0] + transforms[..., 3]
         return skin(transforms, self.weights, points) + place, moved + place
 
 

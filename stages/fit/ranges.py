@@ -34,7 +34,7 @@ class Ranges:
     high: Tensor
 
     def of(self, rotation: Tensor) -> Tensor:
-        """The limited components: [T, 55, 3] -> [T, K]."""
+        """The limited components: rotation vectors [T, 55, 3] -> [T, K]."""
         return rotation.flatten(1)[:, 3 * self.joint + self.axis]
 
 

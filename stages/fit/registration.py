@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
@@ -72,9 +73,12 @@ def register(
     movable = movable_joints(model, seen, observations.vague)
     objective = Objective(body, observations, model, views, initial, movable, settings)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
-    fitted = optimise(objective, initial, settings.iterations, frozen, settings.learning_rate, report)
+    fitted = optimise(
+        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, report
+    )
     with torch.no_grad():
-        rotation = continuous(objective.predict(fitted).rotation)
+        matrices = torch.where(movable[:, None, None], fitted.matrices, initial.matrices)
+        rotation = continuous(roma.rotmat_to_rotvec(matrices))
         identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
     poses = Poses(tuple(keypoints.frames.tolist()), rotation, fitted.expression, fitted.transl)
     return Registration(identity, poses, observations, objective.residuals(fitted))

@@ -43,6 +43,20 @@ def initial_loss(value: Tensor, initial: Tensor) -> Tensor:
     return (value - initial).square()
 
 
+def rotation_loss(matrices: Tensor, initial: Tensor) -> Tensor:
+    """L_init, Eq. 3, for rotations: |R - R*|_F^2 / 2, which is near the squared angle between them.
+
+    Unlike a difference of rotation vectors it has no seam at pi.
+
+    Args:
+        matrices, initial: [..., 3, 3].
+
+    Returns:
+        [...], 2 (1 - cos angle), square radians for small angles.
+    """
+    return (matrices - initial).square().sum((-2, -1)) / 2
+
+
 def shape_loss(betas: Tensor) -> Tensor:
     """L_shape in Eq. 5: beta^2, [B]."""
     return betas.square()
@@ -151,3 +165,46 @@ def acceleration(values: Tensor, times: Tensor) -> Tensor:
 def _like(gap: Tensor, values: Tensor) -> Tensor:
     """[T - 1] -> [T - 1, 1, ...] of the values' dtype."""
     return gap.to(values.dtype).reshape(-1, *[1] * (values.dim() - 1))
+
+
+def face_vertex_loss(points: Tensor, target: Tensor) -> Tensor:
+    """L_vertex in Eq. 4: L1 distance between the body's face and the face that was fitted first.
+
+    Args:
+        points: V_face + Delta V_face, [F, 3], metres.
+        target: V_FLAME at the same points, [F, 3], in the same frame of reference.
+
+    Returns:
+        [F], metres, |x| + |y| + |z|.
+    """
+    return (points - target).abs().sum(-1)
+
+
+def face_laplacian_loss(points: Tensor, target: Tensor, laplacian: Tensor) -> Tensor:
+    """L_lap in Eq. 4: squared L2 distance between uniform Laplacians, so that both faces curve alike.
+
+    Args:
+        points, target: [F, 3], metres.
+        laplacian: [F, F], dense or sparse, takes places to mean of neighbours minus self.
+
+    Returns:
+        [F], square metres.
+    """
+    return (laplacian @ (points - target)).square().sum(-1)
+
+
+def face_edge_loss(points: Tensor, target: Tensor, edges: Tensor) -> Tensor:
+    """L_edge in Eq. 4: L1 distance between edge lengths, which keeps the mesh from stretching.
+
+    Args:
+        points, target: [F, 3], metres.
+        edges: [L, 2], the ends of each edge.
+
+    Returns:
+        [L], metres.
+    """
+
+    def lengths(places: Tensor) -> Tensor:
+        return (places[edges[:, 0]] - places[edges[:, 1]]).norm(dim=-1)
+
+    return (lengths(points) - lengths(target)).abs()

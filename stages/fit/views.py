@@ -29,6 +29,10 @@ class Views:
     centre: Tensor
     size: Tensor
 
+    def rows(self, rows: slice) -> Views:
+        """The cameras of some frames."""
+        return Views(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+
     def to_camera(self, points: Tensor) -> Tensor:
         """World points in the camera's axes: [T, N, 3] -> [T, N, 3], metres."""
         return points @ self.rotation.mT + self.translation[:, None]

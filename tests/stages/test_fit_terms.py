@@ -14,11 +14,12 @@ from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix
 from stages.fit.hands import trusted_hands
 from stages.fit.initialise import continuous, torso_orientation
 from stages.fit.observations import drop_guesses, observe, visible
-from stages.fit.optimise import bumps, finite_sum, rate
+from stages.fit.optimise import finite_sum, rate
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.ranges import joint_ranges
 from stages.fit.registration import views_of
 from stages.fit.settings import FitSettings
+from stages.fit.windows import bumps
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
 
 
@@ -190,10 +191,10 @@ def test_landmarks_skin_as_the_mesh_does(model):
         parameters.joint_offset.copy_(0.01 * torch.randn(55, 3, generator=generator))
         identity = Identity(parameters.betas, parameters.joint_offset, torch.zeros_like(body.v_template))
         vertices, joints = pose_body(
-            body, identity, parameters.rotation, parameters.expression, parameters.transl
+            body, identity, clip.poses.rotation, parameters.expression, parameters.transl
         )
         expected = locate(points, joints, vertices)
-        found, moved = narrowed(small, 3).posed(parameters, parameters.rotation)
+        found, moved = narrowed(small, 3).posed(parameters, parameters.matrices)
         assert (moved - joints).norm(dim=-1).max() < 1e-5
         assert (found - expected).norm(dim=-1).max() < 1e-4
 
@@ -307,9 +308,12 @@ def test_continuous_rotation_vectors_turn_the_same():
 
 def test_bumps_keep_a_common_step_and_end_with_single_frames():
     times = torch.tensor([0.0, 1.0, 2.0, 9.0])
-    assert torch.allclose(bumps(times, 2.0).sum(1), torch.ones(4))
-    assert torch.equal(bumps(times, 0.0), torch.eye(4))
-    assert bumps(times, 2.0)[0, 3] < 1e-3 < bumps(times, 2.0)[0, 1]
+    assert torch.allclose(bumps(times, 2.0)[0].sum(1), torch.ones(4))
+    assert torch.equal(bumps(times, 0.0)[0], torch.eye(4))
+    assert bumps(times, 2.0)[0][0, 3] == 0 < 1e-3 < bumps(times, 2.0)[0][0, 1]
+    part, first, last = bumps(times, 2.0, 1, 3)
+    assert (first, last) == (0, 3)
+    assert torch.equal(part, bumps(times, 2.0)[0][1:3, :3])
 
 
 def test_rate_is_coarse_to_fine():
@@ -325,7 +329,7 @@ def test_loss_that_is_not_finite_is_named():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("iterations", 0), ("betas", 0), ("smoothness", -1.0), ("score_threshold", 1.5)]
+    ("name", "value"), [("iterations", -1), ("betas", 0), ("smoothness", -1.0), ("score_threshold", 1.5)]
 )
 def test_settings_refuse_what_cannot_work(name, value):
     with pytest.raises(ValueError, match=f"fit.{name} must"):
