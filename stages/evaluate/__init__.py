@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=1,
+    version=2,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
@@ -16,7 +16,7 @@ STAGE = Stage(
             "split.json",
             "footage.json",
         ),
-        "fit": ("poses.parquet", "overlay.mp4", "overlay.png"),
+        "fit": ("poses.parquet", "curve.parquet", "overlay.mp4", "overlay.png"),
         "train": ("avatar.safetensors", "curve.parquet", "visibility.parquet", "poses.parquet"),
     },
     assets=("lpips",),

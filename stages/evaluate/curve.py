@@ -1,44 +1,21 @@
-"""The training curve as a drawing that suits light and dark pages."""
+"""The curves of fit and train as drawings that suit light and dark pages."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
-from pipeline.tables import read_table
+from pipeline.curves import Line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-SCHEMA = pa.schema([("iteration", pa.int32()), ("name", pa.string()), ("value", pa.float32())])
-"""Train's curve.parquet; names are ``psnr``, ``gaussians``, ``learning_rate`` and the loss terms."""
-
-Line = list[tuple[int, float]]
-"""(iteration, value), in the order of the iterations."""
 
 _PSNR = "psnr"
 _NO_LOSS = (_PSNR, "gaussians", "learning_rate")
 _IMAGE_TERMS = {"l1": "L1", "ssim": "SSIM"}
 _INK = "#808080"  # legible on white and on near-black
 _COLORS = ("#3b82c4", "#d07f2c", "#5a9e6f")
-
-
-def read_curve(path: Path) -> dict[str, Line]:
-    """Name -> line of train's ``curve.parquet``.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
-    columns = read_table(path, SCHEMA, "run the train stage again")
-    lines: dict[str, Line] = {}
-    rows = zip(*(columns[name].tolist() for name in SCHEMA.names), strict=True)
-    for iteration, name, value in rows:
-        lines.setdefault(name, []).append((iteration, value))
-    return lines
 
 
 def draw_curve(lines: Mapping[str, Line]) -> list[str]:
@@ -49,6 +26,17 @@ def draw_curve(lines: Mapping[str, Line]) -> list[str]:
     losses = _loss_lines(lines)
     held_out = {"held out": lines[_PSNR]} if lines.get(_PSNR) else {}
     return [_draw(title, group) for title, group in (("PSNR, dB", held_out), ("loss", losses)) if group]
+
+
+def draw_fit(lines: Mapping[str, Line], seconds: Mapping[int, float]) -> list[str]:
+    """What accuracy cost the registration: reprojection error against seconds, an SVG; none without both.
+
+    Args:
+        lines: fit's curve.
+        seconds: iteration -> seconds since its start, as recorded beside it.
+    """
+    pixels = [(seconds[step], value) for step, value in lines.get("pixels", []) if step in seconds]
+    return [_draw("reprojection error, px", {"all trusted points": pixels}, "seconds")] if pixels else []
 
 
 def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
@@ -62,7 +50,7 @@ def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
     return {**found, "regularisers": sorted(rest.items())} if rest else found
 
 
-def _draw(title: str, group: Mapping[str, Line]) -> str:
+def _draw(title: str, group: Mapping[str, Sequence[tuple[float, float]]], across: str = "iteration") -> str:
     # Slow to import, and only this function draws.
     import matplotlib
     from matplotlib.figure import Figure
@@ -70,24 +58,24 @@ def _draw(title: str, group: Mapping[str, Line]) -> str:
     # Without a salt every drawing has ids of its own, and equal runs would differ.
     with matplotlib.rc_context({"svg.hashsalt": f"flexiavatar {title}", "font.size": 9}):
         figure = Figure(figsize=(4.6, 2.9), layout="constrained")
-        _fill(figure.add_subplot(), title, group)
+        _fill(figure.add_subplot(), title, group, across)
         text = io.StringIO()
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     svg = text.getvalue()
     return svg[svg.index("<svg") :]
 
 
-def _fill(axes: Axes, title: str, group: Mapping[str, Line]) -> None:
+def _fill(axes: Axes, title: str, group: Mapping[str, Sequence[tuple[float, float]]], across: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for color, (label, line) in zip(_COLORS, group.items(), strict=False):
-        iterations, values = zip(*line, strict=True)
-        axes.plot(iterations, values, color=color, linewidth=1.8, marker="o", markersize=3, label=label)
+        places, values = zip(*line, strict=True)
+        axes.plot(places, values, color=color, linewidth=1.8, marker="o", markersize=3, label=label)
     if title == "loss" and all(value > 0 for line in group.values() for _, value in line):
         axes.set_yscale("log")
     axes.set_title(title, loc="left", color=_INK, fontsize=10)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    axes.set_xlabel("iteration", color=_INK)
+    axes.set_xlabel(across, color=_INK)
     axes.tick_params(which="both", colors=_INK)
     axes.grid(color=_INK, alpha=0.25, linewidth=0.6)
     for side, spine in axes.spines.items():

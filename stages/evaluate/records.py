@@ -64,6 +64,15 @@ def stage_records(inputs: Mapping[str, Path]) -> list[StageRecord]:
     return records
 
 
+def fit_seconds(fit: Path) -> dict[int, float]:
+    """Seconds since the registration began at the iterations of fit's curve; empty where not recorded."""
+    timings = _read(fit / RUN).get("timings")
+    recorded = timings.get("curve_seconds") if isinstance(timings, dict) else None
+    rows = recorded if isinstance(recorded, list) else []
+    pairs = [row for row in rows if isinstance(row, list) and len(row) == 2]
+    return {step: float(at) for step, at in pairs if isinstance(step, int) and isinstance(at, int | float)}
+
+
 def read_gate(path: Path) -> Gate:
     """How many of the body's vertices train's ``visibility.parquet`` kept.
 

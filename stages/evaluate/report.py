@@ -38,6 +38,7 @@ class Material:
         turntable: the turn, MP4.
         overlay: the fit drawn over the clip, MP4, and the same as one picture; whichever exists.
         curve: drawings of the training curve, SVG.
+        fit_curve: drawings of what accuracy cost the registration, SVG.
         omissions: what was left out.
         stages: upstream first.
     """
@@ -50,6 +51,7 @@ class Material:
     turntable: Path
     overlay: Sequence[Path]
     curve: Sequence[str]
+    fit_curve: Sequence[str]
     omissions: Sequence[Omission]
     stages: Sequence[StageRecord]
 
@@ -79,6 +81,7 @@ def _contents(material: Material) -> dict[str, Any]:
         "turntable": video_uri(material.turntable),
         "overlay": _overlay(material.overlay),
         "curve": [Markup(drawing) for drawing in material.curve],
+        "fit_curve": [Markup(drawing) for drawing in material.fit_curve],
         "omissions": material.omissions,
         "stages": material.stages,
         "total": _total(material.stages),

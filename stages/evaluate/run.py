@@ -13,6 +13,7 @@ import torch
 from pipeline import artifact
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
+from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import shown
 from pipeline.metrics import EROSION, Lpips
@@ -21,11 +22,11 @@ from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context
 from stages.evaluate.assessment import Assessment, assess, scored_frames
-from stages.evaluate.curve import draw_curve, read_curve
+from stages.evaluate.curve import draw_curve, draw_fit
 from stages.evaluate.evidence import Evidence, read_evidence
 from stages.evaluate.omissions import omissions
 from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
-from stages.evaluate.records import StageRecord, read_gate, stage_records
+from stages.evaluate.records import StageRecord, fit_seconds, read_gate, stage_records
 from stages.evaluate.rendering import Animate, on_grey, render_frame
 from stages.evaluate.report import Material, write_report
 from stages.evaluate.scoring import Scorer, table, write_scores
@@ -97,7 +98,8 @@ def gather(
         error_gain=settings.error_gain,
         turntable=context.output / "turntable.mp4",
         overlay=(fit / "overlay.mp4", fit / "overlay.png"),
-        curve=draw_curve(read_curve(train / "curve.parquet")),
+        curve=draw_curve(read_curve(train / "curve.parquet", "run the train stage again")),
+        fit_curve=draw_fit(read_curve(fit / "curve.parquet", "run the fit stage again"), fit_seconds(fit)),
         omissions=omissions(evidence, settings, assessment.scores, gate),
         stages=[*stage_records(context.inputs), own],
     )

@@ -47,6 +47,38 @@ def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, thresh
     return trusted
 
 
+def trusted_flat_hands(
+    hands: np.ndarray, seen: np.ndarray, wrists: np.ndarray, seen_wrists: np.ndarray
+) -> np.ndarray:
+    """Which hand detections to believe where nothing has depth: those of which most points are seen.
+
+    Where both hands were found at one place (their boxes overlap by more than half of their union), one
+    goes. If the arms' wrists are seen, it is the hand that lies farther from its own wrist by more than
+    half a palm: most such pairs are one hand found twice. Else it is the farther from the camera, whose
+    palm looks smaller by more than a fifth; and between palms of one size the one that scores less.
+
+    Args:
+        hands: [T, 2, 21, 3], x, y in pixels and score.
+        seen: [T, 2, 21] bool, which of their points to believe.
+        wrists: [T, 2, 3], the left and the right wrist of the arms.
+        seen_wrists: [T, 2] bool, which wrists to believe.
+
+    Returns:
+        [T, 2] bool.
+    """
+    trusted = seen.mean(2) > 0.5
+    hands, wrists = np.nan_to_num(hands), np.nan_to_num(wrists)
+    double = trusted.all(1) & (_overlap(hands[:, 0, :, :2], hands[:, 1, :, :2]) > 0.5)
+    palm = np.linalg.norm(hands[:, :, 9, :2] - hands[:, :, 0, :2], axis=-1)
+    away = np.linalg.norm(hands[:, :, 0, :2] - wrists[..., :2], axis=-1)
+    by_wrist = seen_wrists.all(1) & (np.abs(away[:, 0] - away[:, 1]) > 0.5 * palm.max(1))
+    by_palm = palm.min(1) < 0.8 * palm.max(1)
+    worse = np.where(by_palm, palm.argmin(1), hands[..., 2].mean(2).argmin(1))
+    worse = np.where(by_wrist, away.argmax(1), worse)
+    trusted[double, worse[double]] = False
+    return trusted
+
+
 def _leaps(places: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
     """Frames whose place is farther than ``limit`` from the nearest known frames before and after."""
     leap = np.zeros(len(places), bool)

@@ -5,7 +5,9 @@ outside the picture, or when one of these rules says that it is a guess:
 
 - hips of somebody whose knees are not in the picture;
 - the pose estimator's face where a face mesh was found, and its hand where a hand was found;
-- a hand that ``hands.py`` does not trust.
+- a hand that ``hands.py`` does not trust, and the face where ``facing.py`` finds it turned away.
+
+Without the mask, which is the paper's ablation, every detection counts that the estimator returned at all.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from torch import Tensor
 from pipeline import keypoints as coco
 from pipeline.body.landmarks import Landmarks, PointSet, join
 from pipeline.keypoints import Keypoints
-from stages.fit.hands import trusted_hands
+from stages.fit.facing import POSE_TURNED, TURNED, mesh_facing, points_facing
+from stages.fit.hands import trusted_flat_hands, trusted_hands
 
 GROUPS = ("body", "left_hand", "right_hand", "face")
 """The groups that residuals are reported by; ``Observations.group`` holds indices into it."""
@@ -92,7 +95,14 @@ class Observations:
         return self.group == GROUPS.index(group)
 
 
-def observe(keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray) -> Observations:
+def observe(
+    keypoints: Keypoints,
+    landmarks: Landmarks,
+    threshold: float,
+    sizes: np.ndarray,
+    masked: bool = True,
+    facing: np.ndarray | None = None,
+) -> Observations:
     """Choose the point sets that the estimator gave and mask what cannot be trusted.
 
     Args:
@@ -100,32 +110,32 @@ def observe(keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes:
         landmarks: where the points lie on the body.
         threshold: tau, the score under which a point is masked.
         sizes: [T, 2], width and height of each frame in pixels.
+        masked: False sets m = 1 for every finite detection with a place or a score.
+        facing: [T], cosine between the initial pose's face and the way to the camera, where one is
+            known (``facing.pose_facing``); asked only where the face's points have no depth.
     """
     if (keypoints.pose_image[..., 3] > 0).any():
-        return _from_mediapipe(keypoints, landmarks, threshold, sizes)
-    return _from_whole_body(keypoints, landmarks, threshold, sizes)
+        return _from_mediapipe(keypoints, landmarks, threshold, sizes, masked)
+    return _from_whole_body(keypoints, landmarks, threshold, sizes, masked, facing)
 
 
 def _from_mediapipe(
-    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray
+    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray, masked: bool
 ) -> Observations:
     """33 pose points, 2 x 21 hand points and 478 face points."""
-    pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
-    seen_hand = trusted_hands(hands, pose, keypoints.pose_world, threshold)
-    seen_face = (mesh[..., 3] >= threshold).mean(1) > 0.5
-    pose_mask = visible(pose, threshold, sizes)
-    pose_mask[:, POSE_FACE] &= ~seen_face[:, None]
-    drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES)
-    for side, doubles in enumerate(POSE_OF_HAND):
-        pose_mask[:, doubles] &= ~seen_hand[:, side, None]
-    hand_mask = visible(hands, threshold, sizes) & seen_hand[..., None]
-    face_mask = visible(mesh, threshold, sizes) & seen_face[:, None]
-    mask = np.concatenate([pose_mask, hand_mask.reshape(len(mesh), 42), face_mask], axis=1)
-    pixels = np.concatenate([pose[..., :2], hands.reshape(len(mesh), 42, 4)[..., :2], mesh[..., :2]], axis=1)
+    sets = pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
+    world, count = keypoints.pose_world, len(mesh)
+    if masked:
+        pose_mask, hand_mask, face_mask = _mediapipe_masks(keypoints, threshold, sizes)
+        world_mask = world[..., 3] >= threshold
+    else:
+        pose_mask, hand_mask, face_mask = (detected(points) for points in sets)
+        world_mask = detected(world)
+    mask = np.concatenate([pose_mask, hand_mask.reshape(count, 42), face_mask], axis=1)
+    pixels = np.concatenate([pose[..., :2], hands.reshape(count, 42, 4)[..., :2], mesh[..., :2]], axis=1)
     group = np.repeat([0, 1, 2, 3], [33, 21, 21, 478])
     weight = np.concatenate([_pose_weights(), np.full(42, _HAND_WEIGHT), np.full(478, _MESH_WEIGHT)])
-    world = keypoints.pose_world
-    limbs = _directions(world[..., :3], LIMBS, 0, _both(world[..., 3] >= threshold, LIMBS))
+    limbs = _directions(world[..., :3], LIMBS, 0, _both(world_mask, LIMBS))
     limbs.weight.mul_(_LIMB_DIRECTION)
     limbs.weight[:, _limbs_of_hips()] *= torch.from_numpy(pose_mask[:, POSE_HIPS].any(1)).float()[:, None]
     return _assemble(
@@ -139,20 +149,33 @@ def _from_mediapipe(
     )
 
 
+def _mediapipe_masks(
+    keypoints: Keypoints, threshold: float, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Masks of pose [T, 33], hands [T, 2, 21] and face [T, 478]."""
+    pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
+    seen_hand = trusted_hands(hands, pose, keypoints.pose_world, threshold)
+    seen_face = ((mesh[..., 3] >= threshold).mean(1) > 0.5) & (mesh_facing(mesh) >= TURNED)
+    pose_mask = visible(pose, threshold, sizes)
+    pose_mask[:, POSE_FACE] &= ~seen_face[:, None]
+    drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES)
+    for side, doubles in enumerate(POSE_OF_HAND):
+        pose_mask[:, doubles] &= ~seen_hand[:, side, None]
+    hand_mask = visible(hands, threshold, sizes) & seen_hand[..., None]
+    return pose_mask, hand_mask, visible(mesh, threshold, sizes) & seen_face[:, None]
+
+
 def _from_whole_body(
-    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray
+    keypoints: Keypoints,
+    landmarks: Landmarks,
+    threshold: float,
+    sizes: np.ndarray,
+    masked: bool,
+    facing: np.ndarray | None,
 ) -> Observations:
     """The 133 points of COCO-WholeBody, which have no depth."""
     points = keypoints.whole_body
-    mask = visible(points, threshold, sizes)
-    seen_face = mask[:, coco.FACE].mean(1) > 0.5
-    mask[:, coco.FACE] &= seen_face[:, None]
-    mask[:, :5] &= ~seen_face[:, None]
-    drop_guesses(mask, (11, 12), (13, 14))
-    for hand, wrist in ((coco.LEFT_HAND, 9), (coco.RIGHT_HAND, 10)):
-        seen_hand = mask[:, hand].mean(1) > 0.5
-        mask[:, hand] &= seen_hand[:, None]
-        mask[:, wrist] &= ~seen_hand
+    mask = _whole_body_mask(points, threshold, sizes, facing) if masked else detected(points)
     group = np.repeat([0, 3, 1, 2], [23, 68, 21, 21])
     body = np.ones(23)
     body[1:3], body[5:11], body[11:13] = 0.3, 1.5, 0.5
@@ -167,6 +190,26 @@ def _from_whole_body(
         hands=np.r_[9:11, coco.LEFT_HAND, coco.RIGHT_HAND],
         shoulders=(5, 6),
     )
+
+
+def _whole_body_mask(
+    points: np.ndarray, threshold: float, sizes: np.ndarray, facing: np.ndarray | None
+) -> np.ndarray:
+    """The mask of the 133 points: [T, 133]."""
+    mask = visible(points, threshold, sizes)
+    looks = points_facing(points[:, coco.FACE], points[:, 3:5], threshold) >= TURNED
+    if facing is not None:
+        looks &= facing >= POSE_TURNED
+    seen_face = (mask[:, coco.FACE].mean(1) > 0.5) & looks
+    mask[:, coco.FACE] &= seen_face[:, None]
+    mask[:, :5] &= ~seen_face[:, None]
+    drop_guesses(mask, (11, 12), (13, 14))
+    hands, seen = (np.stack([a[:, coco.LEFT_HAND], a[:, coco.RIGHT_HAND]], axis=1) for a in (points, mask))
+    seen_hands = trusted_flat_hands(hands, seen, points[:, 9:11], mask[:, 9:11])
+    for side, hand in enumerate((coco.LEFT_HAND, coco.RIGHT_HAND)):
+        mask[:, hand] &= seen_hands[:, side, None]
+        mask[:, 9 + side] &= ~seen_hands[:, side]
+    return mask
 
 
 def _assemble(
@@ -208,6 +251,11 @@ def visible(points: np.ndarray, threshold: float, sizes: np.ndarray) -> np.ndarr
     with np.errstate(invalid="ignore"):
         inside = ((points[..., :2] > 0) & (points[..., :2] < limit)).all(-1)
         return inside & (points[..., -1] >= threshold) & (points[..., -1] > 0) & np.isfinite(points).all(-1)
+
+
+def detected(points: np.ndarray) -> np.ndarray:
+    """Which points an estimator returned at all: finite, and with a place or a score. [T, ..., C]."""
+    return np.isfinite(points).all(-1) & ((points[..., :2] != 0).any(-1) | (points[..., -1] > 0))
 
 
 def drop_guesses(

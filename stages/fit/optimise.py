@@ -11,6 +11,7 @@ what their acceleration costs then drowns what the keypoints ask for (an elbow s
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 
@@ -31,6 +32,14 @@ RATES = {
 ROOT_UNTIL, OFFSETS_FROM, ROBUST_FROM = 0.15, 0.4, 0.3
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 """From which share of the iterations on steps have which width in time: standard deviation in frames."""
+
+
+Watch = Callable[[int, float, Callable[[], Parameters]], None]
+"""Called with the number of steps done, the loss before the last, and what gives the parameters."""
+
+
+def ignore(step: int, loss: float, now: Callable[[], Parameters]) -> None:
+    """A watch that looks away."""
 
 
 def rate(name: str, done: float, frozen: frozenset[str] = frozenset()) -> float:
@@ -107,7 +116,7 @@ def optimise(
     frozen: frozenset[str] = frozenset(),
     learning_rate: float = 1.0,
     minibatch: int = 256,
-    report: Callable[[str], None] = lambda note: None,
+    watch: Watch = ignore,
 ) -> Parameters:
     """Fit a clip.
 
@@ -118,7 +127,7 @@ def optimise(
         frozen: names of groups of parameters that stay as they are.
         learning_rate: factor on every step.
         minibatch: frames that are posed at a time, which bounds the memory and changes nothing else.
-        report: called after each step with a note on the loss.
+        watch: called after each step.
 
     Raises:
         FloatingPointError: the loss is not finite.
@@ -135,7 +144,8 @@ def optimise(
                     group["lr"] = learning_rate * rate(group["name"], done, frozen)
                 loss = gradients(objective, base, steps, width, minibatch, done > ROBUST_FROM, step)
                 adam.step()
-                report(f"loss {loss:.3f}")
+                now = functools.partial(_moved, base, steps, objective.times, width, minibatch)
+                watch(step + 1, loss, now)
             base = _moved(base, steps, objective.times, width, minibatch)
     return base
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Landmarks, Poses
 from pipeline.camera import Camera
+from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from stages.fit.face_offset import on_skin, spread_matrix
@@ -20,6 +21,7 @@ from stages.fit.objective import Objective
 from stages.fit.observations import Observations, observe
 from stages.fit.optimise import optimise
 from stages.fit.parameters import landmark_model, movable_joints
+from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views, stack
 
@@ -33,12 +35,16 @@ class Registration:
         poses: theta, psi and translation of every frame.
         observations: what was fitted to.
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
+        curve: loss and reprojection error over the steps.
+        seconds: (step, seconds since the start) at the curve's points.
     """
 
     identity: Identity
     poses: Poses
     observations: Observations
     error: Tensor
+    curve: Curve
+    seconds: tuple[tuple[int, float], ...]
 
 
 def register(
@@ -73,15 +79,18 @@ def register(
     movable = movable_joints(model, seen, observations.vague)
     objective = Objective(body, observations, model, views, initial, movable, settings)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
+    recorder = Recorder(objective, settings.iterations, report)
+    recorder.begin(initial)
     fitted = optimise(
-        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, report
+        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, recorder
     )
     with torch.no_grad():
         matrices = torch.where(movable[:, None, None], fitted.matrices, initial.matrices)
         rotation = continuous(roma.rotmat_to_rotvec(matrices))
         identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
     poses = Poses(tuple(keypoints.frames.tolist()), rotation, fitted.expression, fitted.transl)
-    return Registration(identity, poses, observations, objective.residuals(fitted))
+    error = objective.residuals(fitted)
+    return Registration(identity, poses, observations, error, recorder.curve, tuple(recorder.seconds))
 
 
 def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:

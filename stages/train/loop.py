@@ -14,7 +14,7 @@ from pipeline.metrics.image import psnr
 from pipeline.splat import render
 from stages.train import losses, schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
-from stages.train.curve import Curve
+from pipeline.curves import Curve
 from stages.train.data import Frames
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings

@@ -14,7 +14,7 @@ from stages.evaluate.evidence import read_evidence
 from stages.evaluate.run import evaluate
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
-from stages.train.curve import Curve
+from pipeline.curves import Curve
 from stages.train.visibility import Visibility, write_visibility
 
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
@@ -104,6 +104,8 @@ def make_clip(root, test=TEST):
         points.count({"l1": 1 / iteration, "ssim": 0.5 / iteration, "offset": 1e-3, "pose_offset": 1e-4})
         points.point(iteration, {"psnr": 20.0 + iteration, "gaussians": 40.0, "learning_rate": 1e-3})
     points.write(train / "curve.parquet")
+    registration = Curve([(0, "pixels", 20.0), (50, "pixels", 2.0)])
+    registration.write(fit / "curve.parquet")
     kept = torch.arange(50) < 40
     write_visibility(train / "visibility.parquet", Visibility(3, kept.long() * 3, kept.float(), kept))
     return Clip(root, inputs)

@@ -10,6 +10,7 @@ import torch
 from rich.console import Console
 
 from pipeline.body import Poses, write_poses
+from pipeline.curves import read_curve
 from pipeline.errors import UserError
 from pipeline.frames import write_mask
 from pipeline.metrics import PSNR_CAP
@@ -169,11 +170,13 @@ def test_the_report_shows_what_it_must(published):
 
 def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip):
     fit = clip.inputs["fit"]
-    (fit / "run.json").write_text('{"seconds": 12.34}')
+    timed = {"seconds": 12.34, "timings": {"curve_seconds": [[0, 0.0], [50, 4.5]]}}
+    (fit / "run.json").write_text(json.dumps(timed))
     (fit / "manifest.json").write_text('{"settings": {"iterations": 400, "odd": ["a", "b"]}}')
     (clip.inputs["train"] / "run.json").write_text("{broken")
     report = (clip.evaluate() / "report.html").read_text()
     assert "12.3" in report and "fit.iterations" in report and "a, b" in report
+    assert "what accuracy cost" in report
     assert report.count("not recorded") == 2
 
 
@@ -191,12 +194,12 @@ def test_the_fits_overlay_is_embedded(clip, name, kind):
 
 
 def test_curve_and_visibility_are_read_as_train_writes_them(clip):
-    lines = curve.read_curve(clip.inputs["train"] / "curve.parquet")
+    lines = read_curve(clip.inputs["train"] / "curve.parquet", "run train again")
     assert lines["psnr"] == [(10, 30.0), (20, 40.0), (30, 50.0)]
     assert records.read_gate(clip.inputs["train"] / "visibility.parquet") == records.Gate(40, 50)
     assert VISIBILITY.field("kept") == records.VISIBILITY.field("kept")
     with pytest.raises(UserError, match="train stage again"):
-        curve.read_curve(clip.inputs["train"] / "visibility.parquet")
+        read_curve(clip.inputs["train"] / "visibility.parquet", "run the train stage again")
 
 
 def test_the_curve_adds_the_regularisers_up_and_is_drawn_the_same_each_time():

@@ -1,4 +1,4 @@
-"""The training curve: loss terms and held-out PSNR against iterations."""
+"""Curves of an optimisation: values against iterations, and their Parquet file."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from pipeline.tables import write_table
+from pipeline.tables import read_table, write_table
 
 SCHEMA = pa.schema([("iteration", pa.int32()), ("name", pa.string()), ("value", pa.float32())])
+
+Line = list[tuple[int, float]]
+"""(iteration, value), in the order of the iterations."""
 
 
 @dataclasses.dataclass
 class Curve:
     """Rows of (iteration, name, value), in the order of their making.
 
-    Names are the loss terms as weighted in the objective, each the mean since the row before,
-    ``gaussians``, ``learning_rate``, and ``psnr`` of some held-out frames in dB.
+    Names are the loss terms as weighted in the objective, each the mean since the row before, and
+    whatever else a stage measures: train's ``gaussians``, ``learning_rate`` and ``psnr`` of some held-out
+    frames in dB, fit's ``pixels`` of reprojection error.
     """
 
     rows: list[tuple[int, str, float]] = dataclasses.field(default_factory=list)
@@ -47,10 +51,24 @@ class Curve:
         return cls([tuple(row) for row in state["rows"]], dict(state["sums"]), state["count"])
 
     def write(self, path: Path) -> None:
-        """Writes ``curve.parquet``."""
+        """Writes the curve's Parquet file."""
         columns = {
             "iteration": np.array([row[0] for row in self.rows], np.int32),
             "name": np.array([row[1] for row in self.rows], object),
             "value": np.array([row[2] for row in self.rows], np.float32),
         }
         write_table(path, SCHEMA, columns)
+
+
+def read_curve(path: Path, remedy: str) -> dict[str, Line]:
+    """Name -> line of a curve's file.
+
+    Raises:
+        UserError: the file is missing or damaged; the message ends with ``remedy``.
+    """
+    columns = read_table(path, SCHEMA, remedy)
+    lines: dict[str, Line] = {}
+    rows = zip(*(columns[name].tolist() for name in SCHEMA.names), strict=True)
+    for iteration, name, value in rows:
+        lines.setdefault(name, []).append((iteration, value))
+    return lines
