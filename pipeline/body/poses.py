@@ -27,20 +27,27 @@ class Poses:
             the order of ``JOINT_NAMES``; joint 0 is global_orient.
         expression: psi, [T, E].
         transl: [T, 3], metres, added to the posed body.
+        valid: [T] bool, whether the frame's pose was measured: at least one keypoint of it was
+            trusted. The pose of any other frame is interpolated. All True if not given.
     """
 
     frames: tuple[int, ...]
     rotation: Tensor  # [T, 55, 3]
     expression: Tensor  # [T, E]
     transl: Tensor  # [T, 3]
+    valid: Tensor = None  # type: ignore[assignment]  # [T]; never None once it is made
 
     def __post_init__(self) -> None:
         """Refuse arrays whose lengths disagree."""
         count = len(self.frames)
+        if self.valid is None:
+            object.__setattr__(self, "valid", torch.ones(count, dtype=torch.bool))
         if tuple(self.rotation.shape) != (count, _JOINTS, 3):
             raise ValueError(f"rotation has shape {tuple(self.rotation.shape)}, not ({count}, {_JOINTS}, 3)")
         if self.expression.shape[:-1] != (count,) or self.transl.shape != (count, 3):
             raise ValueError("expression and transl must have a row for every frame")
+        if self.valid.shape != (count,) or self.valid.dtype != torch.bool:
+            raise ValueError("valid must have a truth value for every frame")
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -55,27 +62,33 @@ class Poses:
 
 
 def write_poses(path: Path, poses: Poses) -> None:
-    """Write ``poses.parquet``: ``frame`` int32, ``rotation`` [165], ``expression`` [E], ``transl`` [3]."""
+    """Write ``poses.parquet``, a row a frame.
+
+    Columns: ``frame`` int32; ``rotation`` [165], ``expression`` [E] and ``transl`` [3], lists of float32
+    of one size each; ``valid`` bool, whether the pose was measured rather than interpolated.
+    """
     columns = {
         "frame": pa.array(poses.frames, pa.int32()),
         "rotation": _column(poses.rotation.flatten(1)),
         "expression": _column(poses.expression),
         "transl": _column(poses.transl),
+        "valid": pa.array(poses.valid.cpu().numpy(), pa.bool_()),
     }
     pq.write_table(pa.table(columns), path, compression="zstd")
 
 
 def read_poses(path: Path) -> Poses:
-    """Read what ``write_poses`` wrote; tensors are float32.
+    """Read what ``write_poses`` wrote; tensors are float32. Without a column ``valid`` all frames are.
 
     Raises:
         UserError: the file is damaged or lacks a column.
     """
     try:
-        table = pq.read_table(path, columns=["frame", "rotation", "expression", "transl"])
+        table = pq.read_table(path)
         frames = tuple(table["frame"].to_pylist())
         rotation, expression, transl = (_rows(table, name) for name in ("rotation", "expression", "transl"))
-        return Poses(frames, rotation.unflatten(1, (_JOINTS, 3)), expression, transl)
+        valid = {"valid": _truths(table, "valid")} if "valid" in table.column_names else {}
+        return Poses(frames, rotation.unflatten(1, (_JOINTS, 3)), expression, transl, **valid)
     except (OSError, KeyError, ValueError, RuntimeError, pa.ArrowInvalid) as error:
         raise UserError(f"{path} cannot be read as poses ({error}): run the fit stage again") from error
 
@@ -90,3 +103,10 @@ def _rows(table: pa.Table, name: str) -> Tensor:
     column = table[name].combine_chunks()
     flat = column.values.to_numpy(zero_copy_only=False).astype(np.float32)
     return torch.from_numpy(flat.reshape(len(column), column.type.list_size).copy())
+
+
+def _truths(table: pa.Table, name: str) -> Tensor:
+    column = table[name]
+    if column.type != pa.bool_() or column.null_count:
+        raise ValueError(f"column {name!r} must be true or false in every row")
+    return torch.from_numpy(column.to_numpy().astype(bool))

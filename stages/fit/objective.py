@@ -117,7 +117,11 @@ class Objective:
             "keypoints": self._mean(self._keypoints(predicted, robust, window), window),
             "directions": self._mean(self._directions(predicted, window), window),
             "in_front": self._mean(self._in_front(predicted, window), window),
-            "init": settings.lambda_init * self._mean(self._init(parameters, predicted, window), window),
+            "init": settings.lambda_init
+            * (
+                self._mean(self._init(parameters, predicted, window), window)
+                + share * self._betas(parameters)
+            ),
             "sreg": share * settings.lambda_sreg * self._sreg(parameters),
             "smooth": settings.smoothness * self._smooth(parameters, predicted, window),
         }
@@ -185,6 +189,10 @@ class Objective:
             + 50 * outside.sum(1)
         )
 
+    def _betas(self, parameters: Parameters) -> Tensor:
+        """L_init, Eq. 3, of the shape."""
+        return 0.5 * terms.initial_loss(parameters.betas, self.initial.betas).sum()
+
     def _vectors(self, matrices: Tensor) -> Tensor:
         """Rotation vectors of the joints that a prior looks at, zero for the others: [W, 55, 3]."""
         vectors = roma.rotmat_to_rotvec(matrices[:, self.looked_at])
@@ -194,7 +202,7 @@ class Objective:
         """L_sreg, Eq. 5, and the length of the face offsets."""
         face_offset = self.model.face[self.face] @ parameters.face_control
         return (
-            0.1 * terms.shape_loss(parameters.betas).sum()
+            0.05 * terms.shape_loss(parameters.betas).sum()
             + 500 * terms.joint_offset_loss(parameters.joint_offset).sum()
             + 500 * terms.symmetry_loss(parameters.joint_offset, self.mirror_joints).sum()
             + 2000 * terms.face_offset_loss(face_offset).sum()

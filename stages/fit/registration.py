@@ -21,6 +21,7 @@ from stages.fit.objective import Objective
 from stages.fit.observations import Observations, observe
 from stages.fit.optimise import optimise
 from stages.fit.parameters import landmark_model, movable_joints
+from stages.fit.pose_files import InitialPoses, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views, stack
@@ -32,7 +33,7 @@ class Registration:
 
     Attributes:
         identity: beta, Delta J, Delta V_face.
-        poses: theta, psi and translation of every frame.
+        poses: theta, psi and translation of every frame, not smoothed; valid where a point was trusted.
         observations: what was fitted to.
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
         curve: loss and reprojection error over the steps.
@@ -54,6 +55,8 @@ def register(
     cameras: Mapping[int, Camera],
     settings: FitSettings,
     report: Callable[[str], None] = lambda note: None,
+    start: InitialPoses | None = None,
+    log: Callable[[str], None] = lambda note: None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -64,6 +67,8 @@ def register(
         cameras: frame number -> camera.
         settings: the stage's.
         report: called after each step with a note on the loss.
+        start: poses of the same frames to start from; None starts from the estimator's landmarks.
+        log: told in a line each what else a user should know.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
@@ -75,7 +80,10 @@ def register(
     spread = spread_matrix(body, observations.points[on_face])
     betas = min(settings.betas, body.shape_directions.shape[2])
     model = landmark_model(body, observations.points, betas, spread)
-    initial = initial_parameters(keypoints, observations, model, views)
+    if start is None:
+        initial = initial_parameters(keypoints, observations, model, views)
+    else:
+        initial = initial_from_files(start, body, observations, model, views, log)
     movable = movable_joints(model, seen, observations.vague)
     objective = Objective(body, observations, model, views, initial, movable, settings)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
@@ -88,7 +96,8 @@ def register(
         matrices = torch.where(movable[:, None, None], fitted.matrices, initial.matrices)
         rotation = continuous(roma.rotmat_to_rotvec(matrices))
         identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
-    poses = Poses(tuple(keypoints.frames.tolist()), rotation, fitted.expression, fitted.transl)
+    frames, measured = tuple(keypoints.frames.tolist()), observations.mask.any(1)
+    poses = Poses(frames, rotation, fitted.expression, fitted.transl, measured)
     error = objective.residuals(fitted)
     return Registration(identity, poses, observations, error, recorder.curve, tuple(recorder.seconds))
 

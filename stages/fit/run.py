@@ -13,6 +13,7 @@ import trimesh
 from pipeline.body import (
     BodyModel,
     Identity,
+    Poses,
     load_body,
     load_landmarks,
     rest_vertices,
@@ -26,8 +27,10 @@ from pipeline.records import read_cameras, read_footage
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
+from stages.fit.pose_files import read_hand_mean, read_initial_poses, write_peer_files
 from stages.fit.registration import Registration, register
 from stages.fit.residuals import group_means, write_residuals
+from stages.fit.smoothing import smooth
 
 _FPS = 25.0  # of the overlay, where the footage has no clock
 
@@ -41,27 +44,51 @@ def run(context: Context) -> None:
 def _run(context: Context) -> None:
     ingest = context.inputs["ingest"]
     body = load_body(context.body_file)
-    landmarks = load_landmarks(body, context.body)
-    keypoints = read_keypoints(ingest / "keypoints.parquet")
     cameras = read_cameras(ingest / "cameras.parquet")
     start = time.monotonic()
-    with context.progress(context.settings.iterations, "registration") as progress:
-        fitted = register(
-            body, landmarks, keypoints, cameras, context.settings, lambda note: progress.advance(1, note)
-        )
+    fitted = fit_clip(context, body, cameras)
     context.timing("registration_seconds", round(time.monotonic() - start, 2))
     context.timing("curve_seconds", [[step, round(at, 3)] for step, at in fitted.seconds])
     means = group_means(fitted.error, fitted.observations)
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
     context.log(f"reprojection: {summary or 'no keypoint was trusted in any frame'}")
     write_identity(context.output / "identity.safetensors", fitted.identity, body)
-    write_poses(context.output / "poses.parquet", fitted.poses)
+    smoothed = smooth(fitted.poses, context.settings.smoothing_window)
+    write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
     fitted.curve.write(context.output / "curve.parquet")
     write_template(context.output / "template.ply", body, fitted.identity)
     start = time.monotonic()
-    write_overlays(context, body, fitted, cameras)
+    write_overlays(context, body, fitted.identity, smoothed, cameras)
     context.timing("overlay_seconds", round(time.monotonic() - start, 2))
+
+
+def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -> Registration:
+    """Register the body to the clip that ingest published."""
+    settings = context.settings
+    landmarks = load_landmarks(body, context.body)
+    keypoints = read_keypoints(context.inputs["ingest"] / "keypoints.parquet")
+    initial = None
+    if settings.pose_init:
+        frames, mean = keypoints.frames.tolist(), read_hand_mean(context.body_file)
+        initial = read_initial_poses(Path(settings.pose_init), frames, mean, context.log)
+    with context.progress(settings.iterations, "registration") as progress:
+
+        def report(note: str) -> None:
+            progress.advance(1, note)
+
+        return register(body, landmarks, keypoints, cameras, settings, report, initial, context.log)
+
+
+def write_motion(
+    context: Context, body: BodyModel, fitted: Registration, smoothed: Poses, cameras: Mapping[int, Camera]
+) -> None:
+    """Write ``poses.parquet``, which is smoothed, ``poses_raw.parquet``, and on request the peers' files."""
+    write_poses(context.output / "poses.parquet", smoothed)
+    write_poses(context.output / "poses_raw.parquet", fitted.poses)
+    if context.settings.export_peers:
+        folder, mean = context.output / "peers", read_hand_mean(context.body_file)
+        write_peer_files(folder, body, fitted.identity, fitted.poses, smoothed, cameras, mean)
 
 
 def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
@@ -73,15 +100,15 @@ def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
 
 
 def write_overlays(
-    context: Context, body: BodyModel, fitted: Registration, cameras: Mapping[int, Camera]
+    context: Context, body: BodyModel, identity: Identity, poses: Poses, cameras: Mapping[int, Camera]
 ) -> None:
     """Write ``overlay.mp4``, every frame, and ``overlay.png``, a contact sheet."""
-    ingest, poses = context.inputs["ingest"], fitted.poses
+    ingest = context.inputs["ingest"]
     wanted, kept = sheet_rows(len(poses)), {}
     opacity = context.settings.overlay_opacity
 
     def drawing() -> Iterator[np.ndarray]:
-        pictures = overlays(body, fitted.identity, poses, cameras, ingest / "frames", opacity)
+        pictures = overlays(body, identity, poses, cameras, ingest / "frames", opacity)
         with context.progress(len(poses), "overlay") as progress:
             for row, picture in enumerate(pictures):
                 if row in wanted:

@@ -24,7 +24,8 @@ def draw(*shape):
 
 @pytest.fixture
 def poses():
-    return Poses((3, 4, 9), draw(3, 55, 3), draw(3, 38), draw(3, 3))
+    measured = torch.tensor([True, False, True])
+    return Poses((3, 4, 9), draw(3, 55, 3), draw(3, 38), draw(3, 3), measured)
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def test_poses_come_back_as_they_were(tmp_path, poses):
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     back = read_poses(tmp_path / "a.parquet")
     assert back.frames == poses.frames and len(back) == 3 and back.index(9) == 2
-    for name in ("rotation", "expression", "transl"):
+    for name in ("rotation", "expression", "transl", "valid"):
         assert torch.equal(getattr(back, name), getattr(poses, name))
     schema = pq.read_schema(tmp_path / "a.parquet")
     assert [str(kind) for kind in schema.types] == [
@@ -46,7 +47,25 @@ def test_poses_come_back_as_they_were(tmp_path, poses):
         "fixed_size_list<element: float>[165]",
         "fixed_size_list<element: float>[38]",
         "fixed_size_list<element: float>[3]",
+        "bool",
     ]
+
+
+def test_poses_without_the_flag_are_all_valid(tmp_path, poses):
+    path = tmp_path / "poses.parquet"
+    write_poses(path, poses)
+    pq.write_table(pq.read_table(path).drop_columns(["valid"]), path)
+    assert read_poses(path).valid.tolist() == [True] * 3
+    assert Poses((1, 2), draw(2, 55, 3), draw(2, 4), draw(2, 3)).valid.tolist() == [True] * 2
+
+
+def test_a_flag_that_is_no_truth_value_names_the_file(tmp_path, poses):
+    path = tmp_path / "poses.parquet"
+    write_poses(path, poses)
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(4, "valid", [[1, 2, 3]]), path)
+    with pytest.raises(UserError, match="poses.parquet.*valid"):
+        read_poses(path)
 
 
 def test_poses_of_unequal_length_are_an_error():
@@ -54,6 +73,8 @@ def test_poses_of_unequal_length_are_an_error():
         Poses((1, 2), draw(3, 55, 3), draw(2, 4), draw(2, 3))
     with pytest.raises(ValueError, match="a row for every frame"):
         Poses((1, 2), draw(2, 55, 3), draw(3, 4), draw(2, 3))
+    with pytest.raises(ValueError, match="a truth value for every frame"):
+        Poses((1, 2), draw(2, 55, 3), draw(2, 4), draw(2, 3), torch.tensor([True]))
 
 
 def test_no_such_frame_is_an_error(poses):

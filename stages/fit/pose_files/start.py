@@ -1,0 +1,109 @@
+"""Where the optimisation starts if another program has estimated the poses."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pipeline.body import BodyModel
+from stages.fit.initialise import weak_perspective
+from stages.fit.observations import Observations
+from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
+from stages.fit.pose_files.axes import into_world
+from stages.fit.pose_files.read import InitialPoses
+from stages.fit.views import Views
+
+_VERTICES, _TRIANGLES = 10_475, 20_908  # of every release of SMPL-X
+_CHUNK = 256  # frames posed at a time
+
+
+def is_official_smplx(body: BodyModel) -> bool:
+    """Whether coefficients of SMPL-X mean to this body what they mean to SMPL-X.
+
+    Poses carry over between bodies of one skeleton, betas and expressions do not: the open body's are
+    components of its own. The official model is known by its mesh, 10,475 vertices and 20,908 triangles,
+    and by at least ten shape and ten expression directions, which every release has. Gender and release
+    cannot be told, so the coefficients are a start and no more.
+    """
+    counts = body.shape_directions.shape[2], body.expression_directions.shape[2]
+    return len(body.v_template) == _VERTICES and len(body.faces) == _TRIANGLES and min(counts) >= 10
+
+
+def initial_from_files(
+    start: InitialPoses,
+    body: BodyModel,
+    observations: Observations,
+    model: LandmarkModel,
+    views: Views,
+    log: Callable[[str], None] = lambda note: None,
+) -> Parameters:
+    """The start of the optimisation for T frames, from pose files.
+
+    All rotations are the files'. The place is the files' ``trans`` where they have one and it agrees with
+    this clip's cameras; it was found for another focal length, maybe, and then points reproject better
+    from the place that a weak perspective gives them (``initialise.weak_perspective``).
+
+    Args:
+        start: poses of the observations' frames.
+        body: the body.
+        observations: what the fit aims at.
+        model: the landmarks.
+        views: the cameras.
+        log: told in one line each what of the files was not used.
+
+    Raises:
+        ValueError: ``start`` is of other frames.
+    """
+    if start.frames != tuple(observations.frames.tolist()):
+        raise ValueError("the initial poses are not of the observed frames")
+    sizes = model.shape.shape[2], model.expression.shape[2], model.face.shape[1]
+    nowhere = torch.zeros(len(start.frames), 3)
+    shared = _coefficients(start, is_official_smplx(body), sizes, log)
+    pivot = model.joints[0] + model.joint_shape[0] @ shared["betas"]
+    trans = nowhere if start.transl is None else start.transl
+    orient, placed = into_world(start.rotation[:, 0], trans, pivot, views.rotation, views.translation)
+    rotation = torch.cat([orient[:, None].to(start.rotation), start.rotation[:, 1:]], dim=1)
+    parameters = dataclasses.replace(parameters_of(rotation, nowhere, sizes), **shared)
+    points = _landmarks(model, parameters)
+    transl = weak_perspective(points, observations, views)
+    if start.transl is not None:
+        given = placed.to(transl)
+        errors = [_error(points, place, observations, views) for place in (given, transl)]
+        if errors[0] <= errors[1]:
+            transl = given
+        else:
+            log("the pose files' translations are not used: they do not agree with the clip's cameras")
+    return dataclasses.replace(parameters, transl=transl)
+
+
+def _coefficients(
+    start: InitialPoses, official: bool, sizes: tuple[int, int, int], log: Callable[[str], None]
+) -> dict[str, Tensor]:
+    """Betas [B] and expression [T, E]: the files' where they mean something to the body, else zero."""
+    shared = {"betas": torch.zeros(sizes[0]), "expression": torch.zeros(len(start.frames), sizes[1])}
+    found = {"betas": start.betas, "expression": start.expression}
+    if official:
+        for name, values in found.items():
+            if values is not None:
+                count = min(values.shape[-1], shared[name].shape[-1])
+                shared[name][..., :count] = values[..., :count]
+    elif any(values is not None for values in found.values()):
+        log("shape and expression of the pose files are not used: they are SMPL-X's, the body is not")
+    return shared
+
+
+def _landmarks(model: LandmarkModel, parameters: Parameters) -> Tensor:
+    """The posed landmarks, [T, N, 3], some frames at a time."""
+    count = len(parameters.transl)
+    pieces = [parameters.rows(low, min(low + _CHUNK, count)) for low in range(0, count, _CHUNK)]
+    return torch.cat([model.posed(piece, piece.matrices)[0] for piece in pieces])
+
+
+def _error(points: Tensor, transl: Tensor, observations: Observations, views: Views) -> float:
+    """The median distance of trusted landmarks from where they were seen, pixels; 0 if none is."""
+    pixels = views.to_pixels(views.to_camera(points + transl[:, None]))
+    errors = (pixels - observations.pixels).norm(dim=-1)[observations.mask]
+    return float(errors.median()) if len(errors) else 0.0
