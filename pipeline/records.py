@@ -125,6 +125,9 @@ class Footage:
         people: how many people were noticed in the clip; 0 where nobody counted.
         seconds: the time of each kept frame from the clip's start, in the order of the frames.
         sources: what the keypoints and the masks came from.
+        camera: where the cameras came from (``source``), how far the background moves in a second
+            (``displacement``, of the longer side) where it was measured, ``metres_per_unit`` where a scale
+            was applied, and what else that source has to say.
     """
 
     name: str
@@ -138,6 +141,7 @@ class Footage:
     people: int
     seconds: tuple[float, ...]
     sources: Mapping[str, str]
+    camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def write_footage(path: Path, footage: Footage) -> None:

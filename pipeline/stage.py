@@ -56,6 +56,7 @@ class Stage:
         reads_source: whether it reads the footage.
         reads_body: whether it reads the body model and its landmarks.
         path_settings: the settings that may name a file or a folder, whose content then enters the key.
+        path_words: values of theirs that are words, also where a file or folder has that name.
 
     ``assets``, ``reads_source`` and ``reads_body`` may be functions of the settings object, so that a
     stage asks only for what these settings call for.
@@ -70,6 +71,7 @@ class Stage:
     reads_source: bool | Callable[[Any], bool] = False
     reads_body: bool | Callable[[Any], bool] = False
     path_settings: tuple[str, ...] = ()
+    path_words: tuple[str, ...] = ()
 
     def demands(self, settings: Any) -> Demands:
         """What the stage asks for under these settings."""
@@ -88,7 +90,12 @@ class Stage:
         """The files and folders that settings other than the defaults name."""
         defaults = {field.name: field.default for field in dataclasses.fields(self.settings)}
         values = {name: getattr(settings, name) for name in self.path_settings}
-        given = {name: Path(value) for name, value in values.items() if value and value != defaults[name]}
+        words = {"", *self.path_words}
+        given = {
+            name: Path(value)
+            for name, value in values.items()
+            if value not in words and value != defaults[name]
+        }
         return {name: path for name, path in given.items() if path.exists()}
 
 

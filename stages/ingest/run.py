@@ -10,10 +10,12 @@ import shutil
 import time
 from typing import TYPE_CHECKING
 
-from pipeline.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import write_keypoints
 from pipeline.records import Footage, write_cameras, write_footage, write_split
+from stages.ingest.cameras.apply import apply_cameras
+from stages.ingest.cameras.calibration import open_calibration
+from stages.ingest.cameras.choose import Chosen, choose_cameras
 from stages.ingest.detect import Detected, detect
 from stages.ingest.mannequin.publish import run_mannequin
 from stages.ingest.masks import copy_masks, refine_masks
@@ -42,6 +44,7 @@ def run(context: Context) -> None:
     settings, output = context.settings, context.output
     clip = open_clip(context.source)
     sources = open_sources(context)
+    calibration = open_calibration(settings.cameras, settings.camera_name, clip)
     raw_masks = context.work / "raw_masks"
     shutil.rmtree(raw_masks, ignore_errors=True)
     for folder in (raw_masks, output / "frames", output / "masks"):
@@ -51,22 +54,23 @@ def run(context: Context) -> None:
     detected = detect(context, clip, sources, raw_masks)
     context.timing("detect_seconds", round(time.perf_counter() - started, 2))
     check_enough(clip, detected)
-    frames = tuple(int(frame) for frame in detected.keypoints.frames)
-    split = split_frames(frames, settings.test_fraction, settings.test_frames)
 
     started = time.perf_counter()
     if sources.masks is None:
         refine_masks(context, detected.keypoints, raw_masks)
     else:
-        copy_masks(context, frames, raw_masks)
+        copy_masks(context, detected.keypoints.frames.tolist(), raw_masks)
     context.timing("mask_seconds", round(time.perf_counter() - started, 2))
 
-    focal = settings.focal * max(detected.width, detected.height)
-    camera = facing_camera(detected.width, detected.height, focal)
-    write_cameras(output / "cameras.parquet", dict.fromkeys(frames, camera))
+    chosen = choose_cameras(context, clip, detected, calibration)
+    detected = apply_cameras(output, detected, chosen.cameras, chosen.lenses)
+    check_enough(clip, detected)
+    frames = tuple(int(frame) for frame in detected.keypoints.frames)
+    split = split_frames(frames, settings.test_fraction, settings.test_frames)
+    write_cameras(output / "cameras.parquet", {frame: chosen.cameras[frame] for frame in frames})
     write_keypoints(output / "keypoints.parquet", detected.keypoints)
     write_split(output / "split.json", split)
-    write_footage(output / "footage.json", describe(context, clip, detected))
+    write_footage(output / "footage.json", describe(context, clip, detected, chosen))
     write_preview(output / "preview.png", output / "frames", output / "masks", detected.keypoints)
     shutil.rmtree(raw_masks)
     context.log(
@@ -88,7 +92,7 @@ def check_enough(clip: Clip, detected: Detected) -> None:
         )
 
 
-def describe(context: Context, clip: Clip, detected: Detected) -> Footage:
+def describe(context: Context, clip: Clip, detected: Detected, chosen: Chosen) -> Footage:
     """The content of ``footage.json``."""
     return Footage(
         name=clip.path.name,
@@ -102,6 +106,7 @@ def describe(context: Context, clip: Clip, detected: Detected) -> Footage:
         people=detected.people,
         seconds=tuple(round(seconds, 6) for seconds in detected.seconds),
         sources={"keypoints": context.settings.keypoints, "masks": context.settings.masks},
+        camera=chosen.record,
     )
 
 

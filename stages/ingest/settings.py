@@ -19,6 +19,9 @@ class IngestSettings:
     test_fraction: float = 0.1  # the part of the kept frames, at the clip's end, that is held out
     test_frames: int = 0  # how many of the last frames are held out, in place of test_fraction
     focal: float = 1.2  # the camera's focal length over the longer side of the picture
+    cameras: str = "auto"  # pinhole, sfm, a COLMAP model, a calibration file, a folder of cam_params
+    camera_name: str = ""  # which camera of a calibrated rig filmed the clip
+    camera_scale: float = 0.0  # metres a unit of cameras without a scale; 0 finds it from the person
     estimator_long_side: int = 1920  # larger pictures are reduced to this for the estimator
     estimator_short_side: int = 400  # smaller pictures are enlarged towards this, at most three times
     body_score: float = 0.3  # a frame whose best body points score less on average holds no person
@@ -33,6 +36,7 @@ class IngestSettings:
     mannequin_fps: float = 25.0  # frames a second
     mannequin_seed: int = 0  # of the motion, the detector's errors and the picture's grain
     mannequin_identity: int = 0  # seed of shape, clothes, hair and colours
+    mannequin_detector: str = "mediapipe"  # whose errors the keypoints have: mediapipe or heatmap
     mannequin_noise: float = 1.0  # the detector's error on seen points, 1 for a good detector
     mannequin_hand_failures: float = 0.03  # the part of frames in which a hand's detection begins to fail
     mannequin_views: tuple[str, ...] = ()  # unseen cameras that are filmed too: left, right, back, above
@@ -44,9 +48,9 @@ class IngestSettings:
             value = getattr(self, name)
             if not least <= value <= most:
                 raise ValueError(f"ingest.{name} must lie between {least} and {most}, not {value}")
-        for name in ("keypoints", "masks"):
+        for name, words in (("keypoints", "mediapipe"), ("masks", "mediapipe"), ("cameras", "auto")):
             if not getattr(self, name).strip():
-                raise ValueError(f"ingest.{name} must be 'mediapipe' or a folder")
+                raise ValueError(f"ingest.{name} must be '{words}' or a path")
         if self.mannequin:
             spec_of(self)
 
@@ -63,6 +67,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "test_fraction": (0, 0.9),
     "test_frames": (0, 10_000_000),
     "focal": (0.1, 100),
+    "camera_scale": (0, 1e6),
     "estimator_long_side": (128, 8192),
     "estimator_short_side": (32, 8192),
     "body_score": (0, 1),

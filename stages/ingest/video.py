@@ -27,6 +27,7 @@ class Clip:
         fps: frames a second on average; 0 where there is no clock.
         expected: how many frames the source says it has; 0 where it does not say.
         pictures: frame number -> file, for a folder; empty for a video.
+        turns: by how many quarters, counter-clockwise, the rotation flag turns a video's frames.
     """
 
     path: Path
@@ -35,6 +36,7 @@ class Clip:
     fps: float
     expected: int
     pictures: dict[int, Path] = dataclasses.field(default_factory=dict)
+    turns: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +72,8 @@ def open_clip(path: Path) -> Clip:
         height, width = _upright(first, stream.sample_aspect_ratio).shape[:2]
         fps = float(stream.average_rate or stream.guessed_rate or 0)
         seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-        return Clip(path, width, height, fps, stream.frames or round(seconds * fps))
+        expected = stream.frames or round(seconds * fps)
+        return Clip(path, width, height, fps, expected, turns=_turns(first))
 
 
 def read_clip(clip: Clip, stride: int = 1, limit: int = 0) -> Iterator[Picture]:
@@ -137,8 +140,13 @@ def _upright(frame: av.VideoFrame, ratio: Fraction | None) -> np.ndarray:
     if stretch > 0 and abs(stretch - 1) > 1e-3:
         size = (max(1, round(image.shape[1] * stretch)), image.shape[0])
         image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
-    turns = round(frame.rotation / 90) % 4
+    turns = _turns(frame)
     return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
+
+
+def _turns(frame: av.VideoFrame) -> int:
+    """The rotation flag in quarters of a turn, counter-clockwise."""
+    return round(frame.rotation / 90) % 4
 
 
 def _open_folder(path: Path) -> Clip:

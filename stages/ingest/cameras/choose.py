@@ -1,0 +1,224 @@
+"""The cameras of a clip: measured, read or found, then in metres and upright."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pycolmap
+import torch
+
+from pipeline.camera import Camera, facing_camera
+from pipeline.errors import UserError
+from pipeline.keypoints import Keypoints
+from stages.ingest.cameras.apply import select
+from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, pinhole_lens
+from stages.ingest.cameras.gaps import fill_gaps
+from stages.ingest.cameras.lens import LEFT_ALONE, distortion, pinhole_of, stored_view
+from stages.ingest.cameras.motion import measure_motion
+from stages.ingest.cameras.numbering import frames_by_name
+from stages.ingest.cameras.scale import Scale, metric_scale, person_places
+from stages.ingest.cameras.structure import mapped_frames, structure_from_motion
+from stages.ingest.cameras.turning import MOSTLY_TURNS, ONLY_TURNS, chain_turns, unexplained_by_turns
+from stages.ingest.cameras.world import settle
+from stages.ingest.detect import Detected
+from stages.ingest.video import Clip
+
+if TYPE_CHECKING:
+    from pipeline.stage import Context
+
+GAP_SECONDS = 0.5  # over which a camera is interpolated between two that are known
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """The cameras of a clip.
+
+    Attributes:
+        cameras: frame number -> pinhole of the stored frame; kept frames without one are missing.
+        lenses: frame number -> the stored frame's lens, where its distortion has to be taken out.
+        record: for ``footage.json``.
+    """
+
+    cameras: Mapping[int, Camera]
+    lenses: Mapping[int, pycolmap.Camera]
+    record: Mapping[str, Any]
+
+
+def choose_cameras(context: Context, clip: Clip, detected: Detected, given: Calibration | None) -> Chosen:
+    """The cameras of the kept frames.
+
+    Args:
+        context: the stage's; ``frames`` and ``masks`` are written by now.
+        clip: the footage.
+        detected: what was seen in it.
+        given: the user's calibration, if there is one.
+
+    Raises:
+        UserError: the calibration is not of this footage.
+    """
+    settings = context.settings
+    frames = [int(frame) for frame in detected.keypoints.frames]
+    if given is not None:
+        return _from_calibration(context, clip, detected, given)
+    record: dict[str, Any] = {"source": "pinhole", "displacement": None, "metres_per_unit": None}
+    if settings.cameras == "auto":
+        motion = measure_motion(context.output, frames, clip.fps)
+        context.log(str(motion))
+        record["displacement"] = round(motion.displacement, 6) if motion.pairs else None
+    if settings.cameras == "sfm" or (settings.cameras == "auto" and motion.moving):
+        started = time.perf_counter()
+        found = _find(context, clip, detected)
+        context.timing("camera_seconds", round(time.perf_counter() - started, 2))
+        if found is not None:
+            return dataclasses.replace(found, record={**record, **found.record})
+        context.log("cameras: none could be found, so a static pinhole takes their place")
+    focal = settings.focal * max(detected.width, detected.height)
+    camera = facing_camera(detected.width, detected.height, focal)
+    return Chosen(dict.fromkeys(frames, camera), {}, record)
+
+
+def _find(context: Context, clip: Clip, detected: Detected) -> Chosen | None:
+    """Cameras from the background's motion; None where it gives none."""
+    frames = [int(frame) for frame in detected.keypoints.frames]
+    width, height = detected.width, detected.height
+    focal = context.settings.focal * max(width, height)
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    share = unexplained_by_turns(context.output, frames, clip.fps, matrix)
+    if share > ONLY_TURNS:
+        centre = (width / 2, height / 2)
+        found = structure_from_motion(context.output, context.work / "sfm", frames, focal, centre)
+        if not isinstance(found, str):
+            return _from_model(context, clip, detected, found, frames)
+        context.log(f"cameras: structure from motion failed: {found}")
+    rotations = chain_turns(context.output, frames, matrix) if share <= MOSTLY_TURNS else None
+    if rotations is None:
+        context.log(
+            f"cameras: rotations leave {share:.0%} of the background's motion unexplained, or lose it"
+        )
+        return None
+    context.log(f"cameras: rotations only, which leave {share:.1%} of the background's motion unexplained")
+    turned = settle(np.stack(rotations), np.zeros((len(frames), 3)))
+    lens = pinhole_lens(width, height, (focal, focal), (width / 2, height / 2))
+    views = {frame: View(lens, turned[0][row], turned[1][row]) for row, frame in enumerate(frames)}
+    return Chosen(_cameras(views), {}, {"source": "rotation", "unexplained": round(share, 6)})
+
+
+def _from_model(
+    context: Context, clip: Clip, detected: Detected, model: Calibration, frames: list[int]
+) -> Chosen:
+    """The frames of a model of this clip, those between them, in metres."""
+    known = {int(name[:-4]): view for name, view in model.views.items()}
+    lens = next(iter(known.values())).lens
+    mapped = mapped_frames(frames)
+    longest = max(GAP_SECONDS * (clip.fps or 25.0), 3 * float(np.diff(mapped).max(initial=1)))
+    poses = fill_gaps({f: (v.rotation, v.translation) for f, v in known.items()}, frames, int(longest))
+    views = {frame: View(lens, *pose) for frame, pose in poses.items()}
+    scaled, scale = _metric(context, detected.keypoints, views, clip.fps, model)
+    context.log(
+        f"cameras: structure from motion placed {len(known)} of {len(mapped)} frames, focal length "
+        f"{lens.mean_focal_length():.0f} pixels; {scale.note}"
+    )
+    record = {
+        "source": "sfm",
+        "metres_per_unit": scale.metres,
+        "placed": len(known),
+        "interpolated": len(views) - len(set(views) & set(known)),
+    }
+    return Chosen(_cameras(_settled(scaled)), {}, record)
+
+
+def _from_calibration(context: Context, clip: Clip, detected: Detected, given: Calibration) -> Chosen:
+    """The cameras that the user gives."""
+    frames = [int(frame) for frame in detected.keypoints.frames]
+    stored = {
+        name: stored_view(view, clip, detected.width, detected.height, given.path)
+        for name, view in given.views.items()
+    }
+    first = 0
+    if EVERY_FRAME in stored:
+        views = dict.fromkeys(frames, stored[EVERY_FRAME])
+    else:
+        whole = context.settings.stride == 1 and not context.settings.max_frames
+        numbers, first = frames_by_name(stored, clip, detected.read if whole else clip.expected, given.path)
+        known = {numbers[name]: view for name, view in stored.items()}
+        views = {frame: known[frame] for frame in frames if frame in known}
+    if not views:
+        raise UserError(
+            f"{given.path} has a camera for none of the frames that show a person: check its names"
+        )
+    scale = Scale(1.0, "metres as given")
+    if not given.metric:
+        views, scale = _metric(context, detected.keypoints, views, clip.fps, given)
+    bent = {number: distortion(lens) for number, lens in {id(v.lens): v.lens for v in views.values()}.items()}
+    lenses = {f: v.lens for f, v in views.items() if bent[id(v.lens)] > LEFT_ALONE}
+    context.log(
+        f"cameras: {given.kind}, {given.path.name}: {len(views)} of {len(frames)} frames"
+        f"{', counted from 1' if first else ''}; {scale.note}; {_distorted(max(bent.values()), bool(lenses))}"
+    )
+    if not given.upright:
+        views = _settled(views)
+    record = {
+        "source": given.kind,
+        "metres_per_unit": scale.metres,
+        "distortion_pixels": round(max(bent.values()), 3),
+        "undistorted": bool(lenses),
+        "displacement": None,
+    }
+    return Chosen(_cameras(views), lenses, record)
+
+
+def _distorted(pixels: float, taken_out: bool) -> str:
+    if pixels < 1e-3:
+        return "no distortion"
+    fate = "taken out of the frames" if taken_out else "left as it is"
+    return f"distortion of up to {pixels:.2f} pixels {fate}"
+
+
+def _metric(
+    context: Context, keypoints: Keypoints, views: Mapping[int, View], fps: float, model: Calibration
+) -> tuple[dict[int, View], Scale]:
+    """The views with translations in metres."""
+    scale = Scale(context.settings.camera_scale, f"{context.settings.camera_scale:g} metres a unit, as set")
+    if not scale.metres:
+        rows = np.flatnonzero(np.isin(keypoints.frames, list(views)))
+        chosen = [views[int(frame)] for frame in keypoints.frames[rows]]
+        lenses = [view.lens for view in chosen]
+        focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
+        centre = np.array([[lens.principal_point_x, lens.principal_point_y] for lens in lenses])
+        placed, places = person_places(select(keypoints, rows), focal, centre)
+        rotations, translations = (
+            np.stack([getattr(v, n) for v in chosen]) for n in ("rotation", "translation")
+        )
+        scale = metric_scale(rotations[placed], translations[placed], places, fps, model.depth)
+    return {
+        frame: dataclasses.replace(view, translation=view.translation * scale.metres)
+        for frame, view in views.items()
+    }, scale
+
+
+def _settled(views: Mapping[int, View]) -> dict[int, View]:
+    """The same cameras in our world: see :mod:`.world`."""
+    order = sorted(views)
+    rotations, translations = settle(
+        np.stack([views[frame].rotation for frame in order]),
+        np.stack([views[frame].translation for frame in order]),
+    )
+    return {
+        frame: dataclasses.replace(views[frame], rotation=rotations[row], translation=translations[row])
+        for row, frame in enumerate(order)
+    }
+
+
+def _cameras(views: Mapping[int, View]) -> dict[int, Camera]:
+    """The pinholes of views of the stored frames."""
+    cameras = {}
+    for frame, view in sorted(views.items()):
+        lens = pinhole_of(view.lens)
+        arrays = (lens.calibration_matrix(), view.rotation, view.translation)
+        tensors = (torch.tensor(np.asarray(array), dtype=torch.float64) for array in arrays)
+        cameras[frame] = Camera(lens.width, lens.height, *tensors)
+    return cameras

@@ -1,0 +1,125 @@
+"""Calibrated rigs of cameras that stand still: Qualisys and Pose2Sim files.
+
+Both have a world whose Z axis points up; here X stays, Y becomes up and Z what was -Y, so that several
+cameras of one rig share one world.
+"""
+
+from __future__ import annotations
+
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+
+from pipeline.errors import UserError
+from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation
+
+_Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # coordinates there -> coordinates here
+_FIXED_POINT = 64.0  # Qualisys writes pixels in 64ths
+_MILLIMETRES = 1e-3
+
+
+def read_qualisys(path: Path, name: str) -> Calibration:
+    """One camera of a Qualisys calibration (XML).
+
+    The rotation is camera-to-world by columns of axes that look along -Z with Y up; the translation is the
+    camera's place in millimetres. Focal lengths and centre are in 1/64 pixel; distortion is OpenCV's.
+
+    Raises:
+        UserError: not such a file, or no camera of that name.
+    """
+    try:
+        cameras = ElementTree.parse(path).getroot().findall(".//camera")
+    except (ElementTree.ParseError, OSError, ValueError) as error:
+        raise UserError(f"{path} is no Qualisys calibration ({error}): export it again") from None
+    by_name = {camera.get("serial", ""): camera for camera in cameras}
+    camera = by_name[_choose(path, name, list(by_name))]
+    try:
+        place, lens, frame = (_numbers(camera, part) for part in ("transform", "intrinsic", "fov_video"))
+        axes = np.array([[place[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)])
+        centre = np.array([place[axis] for axis in "xyz"]) * _MILLIMETRES
+        focal = [lens[f"focalLength{axis}"] / _FIXED_POINT for axis in "UV"]
+        middle = [lens[f"centerPoint{a}"] / _FIXED_POINT - frame[b] for a, b in (("U", "left"), ("V", "top"))]
+        bend = [lens[key] for key in ("radialDistortion1", "radialDistortion2",
+                                      "tangentalDistortion1", "tangentalDistortion2")]  # fmt: skip
+        size = [int(frame[b] - frame[a]) + 1 for a, b in (("left", "right"), ("top", "bottom"))]
+    except KeyError as error:
+        raise UserError(
+            f"{path}: the camera '{camera.get('serial')}' has no {error}: export it again"
+        ) from None
+    rotation = np.diag([1.0, -1.0, -1.0]) @ axes
+    check_rotation(rotation, f"{path}, camera '{camera.get('serial')}'")
+    return _standing(path, "Qualisys", _lens(size, focal, middle, bend), rotation, -rotation @ centre)
+
+
+def read_toml_rig(path: Path, name: str) -> Calibration:
+    """One camera of a Pose2Sim calibration (TOML): size, matrix, distortions, rotation vector, metres.
+
+    Raises:
+        UserError: not such a file, or no camera of that name.
+    """
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path} is no readable calibration ({error}): export it again") from None
+    by_name = {
+        str(table.get("name", key)): table
+        for key, table in tables.items()
+        if isinstance(table, dict) and "matrix" in table
+    }
+    table = by_name[_choose(path, name, list(by_name))]
+    try:
+        matrix = np.array(table["matrix"], np.float64).reshape(3, 3)
+        turn = np.array(table["rotation"], np.float64).reshape(3)
+        translation = np.array(table["translation"], np.float64).reshape(3)
+        bend = np.array(table.get("distortions", [0.0] * 4), np.float64).reshape(-1)
+        size = [int(side) for side in np.array(table["size"]).reshape(2)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: a camera's table is not complete ({error}): export it again") from None
+    if len(bend) > 4 and np.abs(bend[4:]).max() > 0:
+        raise UserError(f"{path}: of the distortions only k1, k2, p1, p2 are known here: calibrate so")
+    # OpenCV counts from the centre of the first pixel.
+    lens = _lens(size, [matrix[0, 0], matrix[1, 1]], [matrix[0, 2] + 0.5, matrix[1, 2] + 0.5], list(bend[:4]))
+    return _standing(path, "Pose2Sim", lens, cv2.Rodrigues(turn)[0], translation)
+
+
+def _standing(
+    path: Path, kind: str, lens: pycolmap.Camera, rotation: np.ndarray, translation: np.ndarray
+) -> Calibration:
+    view = View(lens, rotation @ _Z_UP_TO_Y_UP.T, translation)
+    return Calibration(path, kind, {EVERY_FRAME: view}, metric=True, upright=True)
+
+
+def _lens(size: list[int], focal: list[float], middle: list[float], bend: list[float]) -> pycolmap.Camera:
+    bend = [*bend, 0.0, 0.0, 0.0, 0.0][:4]
+    return pycolmap.Camera(model="OPENCV", width=size[0], height=size[1], params=[*focal, *middle, *bend])
+
+
+def _choose(path: Path, name: str, names: list[str]) -> str:
+    """The camera that is meant; UserError where it is not said or not there."""
+    if not names:
+        raise UserError(f"{path} holds no camera: export the calibration again")
+    if name in names:
+        return name
+    if not name and len(names) == 1:
+        return names[0]
+    what = f"has no camera '{name}'" if name else "holds several cameras"
+    raise UserError(f"{path} {what}: set ingest.camera_name to one of {', '.join(sorted(names))}")
+
+
+def _numbers(camera: ElementTree.Element, part: str) -> dict[str, float]:
+    """The numeric attributes of a part of a camera; KeyError where the part is not there."""
+    element = camera.find(part)
+    if element is None:
+        raise KeyError(part)
+    numbers: dict[str, Any] = {}
+    for key, text in element.attrib.items():
+        try:
+            numbers[key] = float(text)
+        except ValueError:
+            continue
+    return numbers
