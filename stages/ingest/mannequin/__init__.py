@@ -4,6 +4,6 @@ A :class:`MannequinSpec` says what is filmed; ``footage.make_mannequin`` films i
 ``publish.run_mannequin`` writes what the ingest stage publishes, with the truth beside it.
 """
 
-from stages.ingest.mannequin.spec import FRAMINGS, LAYERS, VIEWS, MannequinSpec
+from stages.ingest.mannequin.spec import DETECTORS, FRAMINGS, LAYERS, VIEWS, MannequinSpec
 
-__all__ = ["FRAMINGS", "LAYERS", "VIEWS", "MannequinSpec"]
+__all__ = ["DETECTORS", "FRAMINGS", "LAYERS", "VIEWS", "MannequinSpec"]

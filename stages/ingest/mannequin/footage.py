@@ -80,6 +80,11 @@ class Filming:
             self._state[row] = states(camera, picture, self.places, row)
             yield picture
 
+    @property
+    def point_states(self) -> np.ndarray:
+        """[T, K] uint8, of every point of ``places``; known once all the pictures have been taken."""
+        return self._state
+
     def finish(self) -> tuple[Keypoints, Truth]:
         """Keypoints and truth, once all the pictures have been taken."""
         camera, places = self.scene.shot.camera, self.places

@@ -7,6 +7,7 @@ from typing import Any
 
 FRAMINGS = ("full", "upper", "head")
 LAYERS = ("stand", "turn", "sway", "gesture", "curl", "speech", "nod")
+DETECTORS = ("mediapipe", "heatmap")
 VIEWS = {"left": (60.0, 0.0), "right": (-60.0, 0.0), "back": (180.0, 0.0), "above": (25.0, 40.0)}
 """Cameras that the pipeline never sees: azimuth towards the subject's left and elevation, degrees."""
 
@@ -31,6 +32,7 @@ class MannequinSpec:
         identity: seed of shape, joint and face offsets, clothes, hair and colours; 0 is a person too.
         noise: the detector's error on seen points, 1 for a good detector, 0 for none.
         hand_failures: the part of the frames in which a hand's detection begins to fail.
+        detector: one of ``DETECTORS``, whose errors the keypoints have; see ``detector.py``.
         views: names of ``VIEWS`` that are filmed as well.
         view_stride: every how many frames the views are filmed.
     """
@@ -44,6 +46,7 @@ class MannequinSpec:
     identity: int = 0
     noise: float = 1.0
     hand_failures: float = 0.03
+    detector: str = "mediapipe"
     views: tuple[str, ...] = ()
     view_stride: int = 10
 
@@ -52,6 +55,10 @@ class MannequinSpec:
         if self.framing not in FRAMINGS:
             raise ValueError(
                 f"the mannequin's framing must be one of {', '.join(FRAMINGS)}, not {self.framing!r}"
+            )
+        if self.detector not in DETECTORS:
+            raise ValueError(
+                f"the mannequin's detector must be one of {', '.join(DETECTORS)}, not {self.detector!r}"
             )
         unknown = [] if self.is_bvh else [name for name in self.layers if name not in LAYERS]
         if unknown:
