@@ -6,21 +6,33 @@ torso is seen; the place comes from a weak-perspective fit of the landmarks to t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from pipeline.body.joints import joint_index
+from pipeline.body import joint_orientations
+from pipeline.body.joints import JAW, joint_index
 from pipeline.keypoints import Keypoints
+from stages.fit.face import FaceTarget
 from stages.fit.observations import POSE_HIPS, POSE_SHOULDERS, Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
 from stages.fit.views import Views
 
 ARMS_DOWN = 1.1
 """Radians about Z by which the shoulders are lowered from the T pose."""
+
+_LIMB_SCORE = 0.4  # of every landmark of a limb that the start believes
+_LIMBS = tuple(
+    ((f"{side}_{first}", f"{side}_{second}", f"{side}_{third}"), [row, row + 2, row + 4])
+    for first, second, third, left in (("shoulder", "elbow", "wrist", 11), ("hip", "knee", "ankle", 23))
+    for side, row in (("left", left), ("right", left + 1))
+)
+"""A limb's joints and its rows among MediaPipe's pose landmarks."""
 
 _UNSEEN_DISTANCE = 3.0  # metres before the camera for a body of which nothing is seen
 
@@ -41,11 +53,71 @@ def initial_parameters(
     rotation[:, joint_index("left_shoulder"), 2] = -ARMS_DOWN
     rotation[:, joint_index("right_shoulder"), 2] = ARMS_DOWN
     rotation[:, 0] = torso_orientation(keypoints, observations, views)
+    bend_limbs(rotation, keypoints, model, views)
     sizes = model.shape.shape[2], model.expression.shape[2], model.face.shape[1]
     parameters = parameters_of(rotation, torch.zeros(count, 3), sizes)
     points, _ = model.posed(parameters, parameters.matrices)
     transl = weak_perspective(points, observations, views)
     return parameters_of(rotation, transl, sizes)
+
+
+def with_face(parameters: Parameters, target: FaceTarget, movable: Tensor) -> Parameters:
+    """The start with the expression and the jaw of the face that was fitted first.
+
+    Frames of which it says nothing take them from their neighbours.
+
+    Args:
+        parameters: of T frames.
+        target: the face.
+        movable: [55] bool, joints that are fitted; the jaw stays where it may not move.
+    """
+    if not target.valid.any():
+        return parameters
+    expression = _interpolated(target.expression, target.valid)
+    jaw = roma.rotvec_to_rotmat(_interpolated(target.jaw, target.valid))[:, None, :, :2].flatten(-2)
+    moved = bool(movable[JAW])
+    return dataclasses.replace(parameters, expression=expression, jaw=jaw if moved else parameters.jaw)
+
+
+def bend_limbs(rotation: Tensor, keypoints: Keypoints, model: LandmarkModel, views: Views) -> None:
+    """Turn arms and legs, in place, as the 3D landmarks say where all of a limb is scored well.
+
+    In the picture alone a forearm that points at the camera and one that points away from it look the
+    same, and from a hanging arm the fit finds either: elbows that bend backwards. Frames that do not know
+    take a limb's rotations from their neighbours.
+
+    Args:
+        rotation: [T, 55, 3], rotation vectors; the torso's is set already.
+        keypoints: the clip's detections; its 3D pose is used.
+        model: the landmarks, for the rest joints.
+        views: the cameras.
+    """
+    world = torch.from_numpy(keypoints.pose_world)
+    above = joint_orientations(rotation, model.parents)
+    for names, rows in _LIMBS:
+        upper, middle, end = (joint_index(name) for name in names)
+        bones = world[:, rows[1:], :3] - world[:, rows[:2], :3]  # [T, 2, 3], in the camera's axes
+        known = (world[:, rows, 3] >= _LIMB_SCORE).all(1) & (bones.norm(dim=-1) > 1e-3).all(1)
+        if not known.any():
+            continue
+        to_parent = above[:, model.parents[upper]].mT @ views.rotation.mT
+        first_bone, second_bone = (to_parent[:, None] @ bones[..., None])[..., 0].unbind(1)
+        first = shortest_turn(model.joints[middle] - model.joints[upper], first_bone)
+        second_bone = (first.mT @ second_bone[..., None])[..., 0]
+        second = shortest_turn(model.joints[end] - model.joints[middle], second_bone)
+        for joint, turn in ((upper, first), (middle, second)):
+            filled = _fill(roma.rotmat_to_unitquat(turn.double()), known)
+            rotation[:, joint] = continuous(roma.unitquat_to_rotvec(filled)).float()
+
+
+def shortest_turn(start: Tensor, end: Tensor) -> Tensor:
+    """The smallest rotation of a direction [3] to others [T, 3]: [T, 3, 3]; none to the opposite one."""
+    start = normalize(start, dim=0).expand_as(end)
+    end = normalize(end, dim=-1)
+    axis = torch.linalg.cross(start, end)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (start * end).sum(-1, keepdim=True))
+    return roma.rotvec_to_rotmat(axis / sine.clamp_min(1e-8) * angle)
 
 
 def torso_orientation(keypoints: Keypoints, observations: Observations, views: Views) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 from pipeline.body import BodyModel, mean_identity, rest_joints
 from pipeline.body.joints import BODY_POSE, JAW
 from stages.fit import terms
+from stages.fit.face import FaceTarget, sface
 from stages.fit.face_offset import mirror_matrix
 from stages.fit.observations import Directions, Observations
 from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
@@ -26,12 +27,16 @@ from stages.fit.windows import Window, windows
 
 LONG_SIDE = 512.0
 _CHEST_DISTANCE = 0.22  # metres; a hand seen before the torso is nearer than the shoulders by this
+_EXPRESSION = 25.0
+_JOINT_OFFSET = 2000.0
+_FACE_LENGTH = 2000.0
+_SFACE = {"vertex": 1e4, "laplacian": 1e7, "edge": 1e4}
 _SATURATION = (40.0, 20.0, 20.0, 20.0)  # pixels, by group: body, hands, face
 
 # What holds each joint of body_pose to its initial rotation; the other joints have 0.3.
 _STIFFNESS = {
-    "spine1": 1.5, "spine2": 1.5, "spine3": 1.5, "neck": 1.5, "head": 1.5, "left_collar": 3.0,
-    "right_collar": 3.0, "left_ankle": 1.0, "right_ankle": 1.0, "left_foot": 1.0, "right_foot": 1.0,
+    "pelvis": 1.0, "spine1": 6.0, "spine2": 6.0, "spine3": 6.0, "neck": 1.5, "head": 1.5, "left_collar": 10.0,
+    "right_collar": 10.0, "left_ankle": 1.0, "right_ankle": 1.0, "left_foot": 1.0, "right_foot": 1.0,
 }  # fmt: skip
 
 
@@ -52,6 +57,21 @@ class Prediction:
     pixels: Tensor
 
 
+@dataclasses.dataclass(frozen=True)
+class Face:
+    """What L_sface compares: the face that was fitted first, and its points on the body."""
+
+    target: FaceTarget
+    model: LandmarkModel
+
+    def loss(self, parameters: Parameters) -> Tensor:
+        """L_sface, Eq. 4, in millimetres and square millimetres, each term a mean over the face."""
+        model = self.model
+        points = model.rest + model.shape @ parameters.betas + model.face @ parameters.face_control
+        found = sface(points, self.target)
+        return sum((_SFACE[name] * value.mean() for name, value in found.items()), points.new_zeros(()))
+
+
 class Objective:
     """The loss of a clip as a function of its parameters."""
 
@@ -64,8 +84,10 @@ class Objective:
         initial: Parameters,
         movable: Tensor,  # [55]
         settings: FitSettings,
+        target: Face | None = None,
     ) -> None:
         """Prepare what does not change during the optimisation."""
+        self.target = target
         self.observations, self.model, self.views = observations, model, views
         self.settings, self.initial = settings, initial
         self.start = initial.matrices
@@ -74,7 +96,7 @@ class Objective:
         self.saturation = torch.tensor(_SATURATION)[observations.group]
         self.scale = (LONG_SIDE / views.size.amax(1))[:, None, None]
         self.times = (observations.frames - observations.frames[0]).float()
-        names = [body.joint_names[j] for j in range(BODY_POSE.start, BODY_POSE.stop)]
+        names = body.joint_names[:JAW]
         self.ranges = joint_ranges()
         self.looked_at = torch.unique(torch.cat([self.ranges.joint, torch.arange(JAW, HANDS.start)]))
         self.stiffness = torch.tensor([_STIFFNESS.get(name, 0.3) for name in names])
@@ -122,6 +144,7 @@ class Objective:
                 self._mean(self._init(parameters, predicted, window), window)
                 + share * self._betas(parameters)
             ),
+            "sface": share * settings.lambda_sface * self._sface(parameters),
             "sreg": share * settings.lambda_sreg * self._sreg(parameters),
             "smooth": settings.smoothness * self._smooth(parameters, predicted, window),
         }
@@ -172,7 +195,7 @@ class Objective:
     def _init(self, parameters: Parameters, predicted: Prediction, window: Window) -> Tensor:
         """L_init, Eq. 3, and the priors on single joints."""
         matrices, start = predicted.matrices, self.start[window.posed]
-        pose = terms.rotation_loss(matrices[:, BODY_POSE], start[:, BODY_POSE]) * self.stiffness
+        pose = terms.rotation_loss(matrices[:, :JAW], start[:, :JAW]) * self.stiffness
         hands = terms.rotation_loss(matrices[:, HANDS], start[:, HANDS])
         expression = terms.initial_loss(parameters.expression, self.initial.expression[window.posed])
         vectors = self._vectors(matrices)
@@ -182,7 +205,7 @@ class Objective:
         return (
             4 * pose.sum(1)
             + 0.45 * hands.sum(1)
-            + 0.5 * expression.sum(1)
+            + _EXPRESSION * expression.sum(1)
             + 200 * jaw[:, 1:].sum(1)
             + 5 * eyes.sum((1, 2))
             + 200 * eyes[..., 2].sum(1)
@@ -198,14 +221,18 @@ class Objective:
         vectors = roma.rotmat_to_rotvec(matrices[:, self.looked_at])
         return vectors.new_zeros(len(matrices), 55, 3).index_copy(1, self.looked_at, vectors)
 
+    def _sface(self, parameters: Parameters) -> Tensor:
+        """L_sface, Eq. 4; zero where no face was fitted."""
+        return parameters.betas.new_zeros(()) if self.target is None else self.target.loss(parameters)
+
     def _sreg(self, parameters: Parameters) -> Tensor:
         """L_sreg, Eq. 5, and the length of the face offsets."""
         face_offset = self.model.face[self.face] @ parameters.face_control
         return (
             0.05 * terms.shape_loss(parameters.betas).sum()
-            + 500 * terms.joint_offset_loss(parameters.joint_offset).sum()
-            + 500 * terms.symmetry_loss(parameters.joint_offset, self.mirror_joints).sum()
-            + 2000 * terms.face_offset_loss(face_offset).sum()
+            + _JOINT_OFFSET * terms.joint_offset_loss(parameters.joint_offset).sum()
+            + _JOINT_OFFSET * terms.symmetry_loss(parameters.joint_offset, self.mirror_joints).sum()
+            + _FACE_LENGTH * terms.face_offset_loss(face_offset).sum()
             + 500 * terms.symmetry_loss(face_offset, self.mirror_face).sum()
         )
 

@@ -15,15 +15,17 @@ from pipeline.camera import Camera
 from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
+from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
-from stages.fit.initialise import continuous, initial_parameters
-from stages.fit.objective import Objective
+from stages.fit.initialise import continuous, initial_parameters, with_face
+from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
 from stages.fit.optimise import optimise
 from stages.fit.parameters import landmark_model, movable_joints
 from stages.fit.pose_files import InitialPoses, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
+from stages.fit.solver import STEPS, solve
 from stages.fit.views import Views, stack
 
 
@@ -74,7 +76,9 @@ def register(
         UserError: a frame has no camera, or there are no frames.
     """
     views = views_of(keypoints, cameras)
-    observations = observe(keypoints, landmarks, settings.score_threshold, views.size.numpy())
+    size = views.size.numpy()
+    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked)
+    target = fit_face(body, landmarks, keypoints, observations, views, settings, log)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
     spread = spread_matrix(body, observations.points[on_face])
@@ -85,13 +89,26 @@ def register(
     else:
         initial = initial_from_files(start, body, observations, model, views, log)
     movable = movable_joints(model, seen, observations.vague)
-    objective = Objective(body, observations, model, views, initial, movable, settings)
+    face = None
+    if target is not None:
+        initial = with_face(initial, target, movable)
+        face = Face(target, landmark_model(body, target.points, betas, spread))
+    objective = Objective(body, observations, model, views, initial, movable, settings, face)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
-    recorder = Recorder(objective, settings.iterations, report)
+    recorder = Recorder(objective, steps_of(settings), report)
     recorder.begin(initial)
-    fitted = optimise(
-        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, recorder
-    )
+    if settings.solver == "lm" and settings.iterations > 0:
+        fitted = solve(objective, initial, frozen, settings.minibatch, recorder)
+    else:
+        fitted = optimise(
+            objective,
+            initial,
+            settings.iterations,
+            frozen,
+            settings.learning_rate,
+            settings.minibatch,
+            recorder,
+        )
     with torch.no_grad():
         matrices = torch.where(movable[:, None, None], fitted.matrices, initial.matrices)
         rotation = continuous(roma.rotmat_to_rotvec(matrices))
@@ -100,6 +117,11 @@ def register(
     poses = Poses(frames, rotation, fitted.expression, fitted.transl, measured)
     error = objective.residuals(fitted)
     return Registration(identity, poses, observations, error, recorder.curve, tuple(recorder.seconds))
+
+
+def steps_of(settings: FitSettings) -> int:
+    """How many steps a fit takes at most: Adam as many as are set, the second-order solver its own number."""
+    return STEPS if settings.solver == "lm" and settings.iterations > 0 else settings.iterations
 
 
 def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:

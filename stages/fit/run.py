@@ -28,7 +28,7 @@ from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
 from stages.fit.pose_files import read_hand_mean, read_initial_poses, write_peer_files
-from stages.fit.registration import Registration, register
+from stages.fit.registration import Registration, register, steps_of
 from stages.fit.residuals import group_means, write_residuals
 from stages.fit.smoothing import smooth
 
@@ -72,7 +72,7 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
     if settings.pose_init:
         frames, mean = keypoints.frames.tolist(), read_hand_mean(context.body_file)
         initial = read_initial_poses(Path(settings.pose_init), frames, mean, context.log)
-    with context.progress(settings.iterations, "registration") as progress:
+    with context.progress(steps_of(settings), "registration") as progress:
 
         def report(note: str) -> None:
             progress.advance(1, note)

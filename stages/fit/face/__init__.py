@@ -1,0 +1,94 @@
+"""Face first: a face fitted to the clip's face points before the body, as start and target of the body's.
+
+``fit_face`` is the whole of it; :class:`FaceTarget` is what it hands on, whichever the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from pipeline.body import BodyModel, Landmarks
+from pipeline.keypoints import Keypoints
+from pipeline.threads import threads
+from stages.fit.face.deca import read_flame_parameters
+from stages.fit.face.flame import face_from_flame
+from stages.fit.face.flame_model import load_flame
+from stages.fit.face.mesh import face_from_mesh
+from stages.fit.face.target import FaceModel, FaceTarget, face_model, sface
+from stages.fit.observations import Observations
+from stages.fit.settings import FitSettings
+from stages.fit.views import Views
+
+__all__ = ["FaceTarget", "fit_face", "sface"]
+
+_MESH_POINTS = 478
+
+
+def fit_face(
+    body: BodyModel,
+    landmarks: Landmarks,
+    keypoints: Keypoints,
+    observations: Observations,
+    views: Views,
+    settings: FitSettings,
+    log: Callable[[str], None] = lambda line: None,
+) -> FaceTarget | None:
+    """Fit a face to the clip by the source that ``settings.face`` names.
+
+    Args:
+        body: the body.
+        landmarks: where the face mesh lies on it.
+        keypoints: the clip's detections; their face mesh is read.
+        observations: made of the same keypoints; says which face points to trust.
+        views: the cameras.
+        settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh`` where the
+            estimator gave a face mesh.
+        log: told in one line what was fitted, or why nothing was.
+
+    Returns:
+        None if it is switched off or no face was seen.
+
+    Raises:
+        UserError: FLAME's model or parameters cannot be used.
+    """
+    if settings.face == "off":
+        log("face first: switched off")
+        return None
+    with threads(1), torch.no_grad():
+        model = face_model(body, landmarks.face_mesh)
+        if settings.face == "flame":
+            parameters = read_flame_parameters(Path(settings.face_init), keypoints.frames)
+            target = face_from_flame(model, body, load_flame(Path(settings.flame_model)), parameters)
+        else:
+            target = _from_mesh(model, keypoints, observations, views)
+    if target is None:
+        log(f"face first: {_why_not(settings, observations)}")
+        return None
+    mean = model.mean[torch.searchsorted(model.rows, target.rows)]
+    log(
+        f"face first ({target.source}): fitted in {int(target.valid.sum())} of {len(target.valid)} frames, "
+        f"{len(target.rows)} points, {1000 * float((target.neutral - mean).norm(dim=1).mean()):.1f} mm "
+        "from the mean face"
+    )
+    return target
+
+
+def _from_mesh(
+    model: FaceModel, keypoints: Keypoints, observations: Observations, views: Views
+) -> FaceTarget | None:
+    mask = observations.mask[:, observations.of("face")]
+    if mask.shape[1] != _MESH_POINTS or not mask.any():
+        return None
+    mesh = torch.from_numpy(keypoints.face_mesh[..., :3])[:, model.rows]
+    return face_from_mesh(model, mesh, mask[:, model.rows], views)
+
+
+def _why_not(settings: FitSettings, observations: Observations) -> str:
+    if settings.face == "flame":
+        return "left out, for DECA found no face in any frame"
+    if int(observations.of("face").sum()) != _MESH_POINTS:
+        return "left out, for the keypoints hold no face mesh"
+    return "left out, for no frame shows enough of a face"
