@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+import numba
 import torch
 
 
@@ -15,6 +16,8 @@ def threads(count: int) -> Iterator[None]:
     At the sizes of a quick run one thread was faster than two on two cores (docs/results.md). With one
     thread equal input also gives equal bytes on any number of cores, gradients of indexing included.
     """
+    # numba's pool sets OpenMP's number of threads, which is torch's too, when it starts: so start it first.
+    numba.get_num_threads()
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:
