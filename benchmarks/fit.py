@@ -65,7 +65,7 @@ MOTIONS = {
     "head": ("nod+speech", "sway+nod+speech"),
 }
 IDENTITIES = (1, 2)
-FRAMES, QUICK_FRAMES = 60, 8
+FRAMES, QUICK_FRAMES = 30, 8
 EFFORTS, QUICK_EFFORTS = (25, 50, 100, 200, 400, 800), (10, 20)
 QUICK_ITERATIONS = 20  # of the error table: enough to see that it runs
 COLUMNS = ("joints", "Procrustes", "body", "surface", "pixels")

@@ -37,7 +37,7 @@ class FitSettings:
     pose_init: str = ""  # folder of SMPLest-X poses, smplx_init/*.json; else the estimator's landmarks
 
     # What is published
-    smoothing_window: int = 9  # frames of the Savitzky-Golay filter, odd; 0 leaves the poses as fitted
+    smoothing_window: int = 5  # frames of the Savitzky-Golay filter, odd; 0 leaves the poses as fitted
     export_peers: bool = False  # write identity and poses in ExAvatar's and FlexiAvatar's JSON layout too
     overlay_opacity: float = 0.6  # of the mesh in overlay.mp4 and overlay.png
 

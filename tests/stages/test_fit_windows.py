@@ -87,7 +87,8 @@ def test_a_fit_in_windows_is_the_fit(model):
 def test_a_masked_frame_keeps_its_initial_pose_where_nothing_else_speaks(model):
     """Far from other frames and without smoothness only L_init is left, whose minimum it starts in.
 
-    Beside seen frames it lies between them (test_fit.py).
+    It may drift by what the ranges of joints still ask for. Beside seen frames it lies between them
+    (test_fit.py).
     """
     clip = make_clip(*model, count=3, gap=100)
     clip.keypoints.pose_image[1, :, 3] = 0.1
@@ -96,8 +97,8 @@ def test_a_masked_frame_keeps_its_initial_pose_where_nothing_else_speaks(model):
     start = register(*model, clip.keypoints, clip.cameras, dataclasses.replace(settings, iterations=0))
     fitted = register(*model, clip.keypoints, clip.cameras, settings)
     moved = (fitted.poses.rotation - start.poses.rotation).norm(dim=-1).amax(1)
-    assert moved[1] < 1e-5
-    assert moved[[0, 2]].min() > 0.2
+    assert moved[1] < 0.01
+    assert moved[[0, 2]].min() > 0.05
 
 
 def test_no_iterations_publish_the_initialisation(model):
@@ -106,4 +107,5 @@ def test_no_iterations_publish_the_initialisation(model):
     assert (start.identity.betas == 0).all() and (start.identity.joint_offset == 0).all()
     assert torch.isfinite(start.poses.rotation).all()
     seen = start.error[~start.error.isnan()]
-    assert 1 < seen.mean() < 60
+    assert seen.mean() < 60
+    assert {step for step, _, _ in start.curve.rows} == {0}
