@@ -1,8 +1,9 @@
-"""The canonical triplane avatar and what it looks like in a pose (the paper's Sections 3.3 and 3.6).
+"""The canonical triplane avatar and what it looks like in a pose (the paper's Sections 3.3, 3.5 and 3.6).
 
-Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads -> plus
-expression -> linear blend skinning -> Gaussians. The part before the pose is the same for every
-frame: ``decode`` once, ``pose`` as often as needed; a finished avatar does so by itself.
+Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads + residual
+colours of face and hands -> plus expression -> linear blend skinning -> Gaussians. The part before
+the pose is the same for every frame: ``decode`` once, ``pose`` as often as needed; a finished avatar
+does so by itself.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from torch import Tensor, nn
 
 from pipeline.avatar.canonical import HANDS, HEAD, Canonical, build_canonical
 from pipeline.avatar.heads import Head
+from pipeline.avatar.posing import Rig
+from pipeline.avatar.residual import Region, Residuals, regions
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
-from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms, vertex_normals
+from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms
 from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
@@ -38,6 +41,10 @@ class Architecture:
         scale: initial standard deviation along the surface, in distances to the neighbours.
         thickness: initial standard deviation along the normal, in those along the surface.
         opacity: of every Gaussian.
+        residual_parts: parts that have a residual colour head, if any of their vertices is kept.
+        residual_width: hidden channels of those heads.
+        residual_place: which place they are told, ``"canonical"`` or ``"posed"`` (see ``residual.py``).
+        place_frequencies, time_frequencies: of the encodings of that place and of the time.
     """
 
     plane_resolution: int = 128
@@ -50,6 +57,11 @@ class Architecture:
     scale: float = 0.55
     thickness: float = 0.5
     opacity: float = 0.999
+    residual_parts: tuple[str, ...] = ()
+    residual_width: int = 64
+    residual_place: str = "canonical"
+    place_frequencies: int = 6
+    time_frequencies: int = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,12 +74,16 @@ class Surface:
         neighbours: the mean over each vertex's neighbours.
         pliable: [N, 1] float, 1 where pose heads may move a vertex: not on head and hands, which
             follow the body model alone.
+        rig: the mesh as skinning without gradient needs it.
+        residual: the parts that have a residual colour head.
     """
 
     canonical: Canonical
     samples: SparsePair
     neighbours: SparsePair
     pliable: Tensor  # [N, 1]
+    rig: Rig
+    residual: tuple[Region, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,13 +113,15 @@ class Posed:
         gaussians: in world coordinates.
         pose_offset: [N, 3], Delta V_pose, metres; None while the pose heads are off.
         log_scale: [N, 3], S_tri + Delta S_pose.
-        color_logit: [N, 3], C_tri + Delta C_pose.
+        color_logit: [N, 3], C_tri + Delta C_pose + Delta C_res.
+        color_residual: [N, 3], Delta C_res; None while the residual heads are off.
     """
 
     gaussians: Gaussians
     pose_offset: Tensor | None
     log_scale: Tensor
     color_logit: Tensor
+    color_residual: Tensor | None = None
 
 
 class Avatar(nn.Module):
@@ -116,6 +134,7 @@ class Avatar(nn.Module):
         body_digest: of the body model that it was built on.
         surfaces: every level from the unsubdivided mesh to the finest.
         pose_heads_active: whether the pose heads take part.
+        residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
     """
 
@@ -142,13 +161,16 @@ class Avatar(nn.Module):
         """
         super().__init__()
         self.architecture, self.kept, self.identity = architecture, kept, identity
-        self.body_digest, self.half_precision, self.pose_heads_active = body.digest, half_precision, True
+        self.body_digest, self.half_precision = body.digest, half_precision
+        self.pose_heads_active = self.residuals_active = True
         meshes = [
             build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
         ]
-        regions, self.boxes = _regions(meshes[-1])
+        planes, self.boxes = _regions(meshes[-1])
+        residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
         self.surfaces = [
-            _surface(mesh, regions[: len(mesh)], self.boxes, architecture.plane_resolution) for mesh in meshes
+            _surface(mesh, planes[: len(mesh)], self.boxes, architecture.plane_resolution, parts)
+            for mesh, parts in zip(meshes, residual, strict=True)
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
         self._build_networks(seed)
@@ -166,6 +188,15 @@ class Avatar(nn.Module):
             self.color = Head(features, 3, **hidden)
             self.pose_geometry = Head(features, 6, condition=pose, **hidden)
             self.pose_color = Head(features + 3, 3, condition=pose, **hidden)
+            # Last, so that an avatar with them starts from the same weights as one without.
+            self.residuals = Residuals(
+                tuple(region.part for region in self.surfaces[0].residual),
+                sizes.residual_place,
+                (sizes.place_frequencies, sizes.time_frequencies),
+                pose,
+                sizes.residual_width,
+                sizes.groups,
+            )
 
     def __len__(self) -> int:
         """The number of Gaussians."""
@@ -201,6 +232,7 @@ class Avatar(nn.Module):
         expression: Tensor,  # [E]
         transl: Tensor,  # [3]
         noise: Tensor | None = None,  # [54 * 6]
+        time: float | None = None,
     ) -> Posed:
         """The Gaussians of one frame.
 
@@ -209,28 +241,34 @@ class Avatar(nn.Module):
             rotation: [55, 3] rotation vectors, radians, the SMPL-X order of joints.
             expression: [E].
             transl: [3], metres.
-            noise: added to what the pose heads are told of the pose; for training.
+            noise: added to what the heads are told of the pose; for training.
+            time: seconds from the clip's start, for the residual colours; None where there is no clock.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
         blended = blend_transforms(transforms, canonical.skinning_weights)
         shape = decoded.offset + _rest_shape(canonical, rotation, expression)
-        log_scale, color_logit, pose_offset = decoded.log_scale, decoded.color_logit, None
+        log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
+        theta = pose_features(rotation.detach())
+        theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
-            normals = _posed_normals(blended.detach(), shape.detach(), canonical.faces)
-            theta = pose_features(rotation.detach())
-            theta = theta if noise is None else theta + noise
+            normals = decoded.surface.rig.normals(transforms, shape)
             pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
+        means = _transform(blended, shape) + transl
+        if self.residuals_active and decoded.surface.residual:
+            with self._autocast():
+                residual = self.residuals(decoded.surface.residual, means, theta, time)
+            color_logit = color_logit + residual
         gaussians = Gaussians(
-            means=_transform(blended, shape) + transl,
-            quaternions=_quaternions(blended.detach()[..., :3] @ canonical.frames),
+            means=means,
+            quaternions=decoded.surface.rig.place(transforms, shape, transl)[1],
             scales=self._scales(canonical, log_scale),
             colors=torch.sigmoid(color_logit),
             opacities=torch.full((len(canonical),), self.architecture.opacity),
         )
-        return Posed(gaussians, pose_offset, log_scale, color_logit)
+        return Posed(gaussians, pose_offset, log_scale, color_logit, residual)
 
     def _pose_heads(self, decoded: Decoded, theta: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
         """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
@@ -260,12 +298,14 @@ class Avatar(nn.Module):
             rotation: [55, 3] rotation vectors, radians.
             expression: [E].
             transl: [3], metres.
-            time: seconds into the clip, for effects that depend on it; no effect does so far.
+            time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
+                the training frames' interval; None, as for a motion that was never filmed, gives what
+                the heads learnt to answer without a clock (see ``residual.py``).
         """
         if self._baked is None:
             with torch.no_grad():
                 self._baked = self.decode()
-        return self.pose(self._baked, rotation, expression, transl).gaussians
+        return self.pose(self._baked, rotation, expression, transl, time=time).gaussians
 
 
 def pose_features(rotation: Tensor) -> Tensor:
@@ -285,15 +325,17 @@ def _regions(finest: Canonical) -> tuple[Tensor, Tensor]:
     """
     head = finest.is_part(*HEAD)
     both = bool(head.any()) and not bool(head.all())
-    regions = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
-    return regions, region_boxes(finest.vertices, regions)
+    planes = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
+    return planes, region_boxes(finest.vertices, planes)
 
 
-def _surface(mesh: Canonical, regions: Tensor, boxes: Tensor, resolution: int) -> Surface:
-    coordinates = normalise(mesh.vertices, regions, boxes)
-    samples = sampling(coordinates, regions, len(boxes), resolution)
+def _surface(
+    mesh: Canonical, planes: Tensor, boxes: Tensor, resolution: int, residual: tuple[Region, ...]
+) -> Surface:
+    coordinates = normalise(mesh.vertices, planes, boxes)
+    samples = sampling(coordinates, planes, len(boxes), resolution)
     pliable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
-    return Surface(mesh, samples, mesh.neighbour_mean(), pliable)
+    return Surface(mesh, samples, mesh.neighbour_mean(), pliable, Rig.build(mesh), residual)
 
 
 def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> Tensor:
@@ -308,13 +350,3 @@ def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> T
 def _transform(blended: Tensor, points: Tensor) -> Tensor:
     # A batched 3x3 product is many times slower on a CPU than the sum written out.
     return (blended[..., :3] * points[:, None, :]).sum(-1) + blended[..., 3]
-
-
-def _posed_normals(blended: Tensor, points: Tensor, faces: Tensor) -> Tensor:
-    with torch.no_grad():
-        return vertex_normals(_transform(blended, points), faces)
-
-
-def _quaternions(matrices: Tensor) -> Tensor:
-    """Nearly orthonormal matrices as unit quaternions, wxyz: [N, 3, 3] -> [N, 4]."""
-    return roma.rotmat_to_unitquat(matrices)[:, [3, 0, 1, 2]].contiguous()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor, nn
 
+from pipeline.avatar.fused import Layers, decode
 from pipeline.avatar.norm import group_norm_relu
 
 
@@ -55,12 +58,24 @@ class Head(nn.Module):
 
     def forward(self, points: Tensor, condition: Tensor | None = None) -> Tensor:
         """Decodes [N, inputs] and an optional shared vector [condition] to [N, outputs]."""
+        if self.condition is not None and condition is None:
+            raise ValueError("this head is conditioned on a vector, and none was given")
+        kind = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
+        if points.device.type == "cpu" and kind in (torch.float32, torch.bfloat16):
+            return decode(points, self._layers(condition), kind)
         x = self.first(points)
-        if self.condition is not None:
-            if condition is None:
-                raise ValueError("this head is conditioned on a vector, and none was given")
+        if self.condition is not None and condition is not None:
             x = x + self.condition(condition[None]).to(x.dtype)
         x = self.norms[0](x)
         x = self.norms[1](self.hidden[0](x))
         x = self.norms[2](self.hidden[1](x))
         return self.last(x)
+
+    def _layers(self, condition: Tensor | None) -> Layers:
+        """The parameters, the condition's part added to the first bias."""
+        layers = Layers.of([self.first, *self.hidden, self.last], list(self.norms))
+        if self.condition is None or condition is None:
+            return layers
+        with torch.autocast("cpu", enabled=False):  # one small product: exact for nothing
+            first = layers.biases[0] + self.condition(condition)
+        return dataclasses.replace(layers, biases=(first, *layers.biases[1:]))

@@ -15,7 +15,7 @@ from pipeline.avatar.avatar import Architecture, Avatar
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError
 
-FORMAT = "flexiavatar-avatar-1"
+FORMAT = "flexiavatar-avatar-2"
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
@@ -41,6 +41,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         "architecture": dataclasses.asdict(avatar.architecture),
         "half_precision": avatar.half_precision,
         "pose_heads_active": avatar.pose_heads_active,
+        "residuals_active": avatar.residuals_active,
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
@@ -63,7 +64,8 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     if header["body"] != body.digest:
         raise UserError(f"{path} was trained on another body model; use that one, or run fit and train again")
     identity = Identity(**{field: tensors[f"identity.{field}"] for field in IDENTITY_FIELDS})
-    architecture = Architecture(**header["architecture"])
+    parts = tuple(header["architecture"]["residual_parts"])  # JSON knows no tuples
+    architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
     avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=header["half_precision"])
     weights = {
         name.removeprefix("network."): tensor
@@ -75,6 +77,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     except RuntimeError as error:
         raise UserError(f"{path} does not fit its own description; run the train stage again") from error
     avatar.pose_heads_active = header["pose_heads_active"]
+    avatar.residuals_active = header["residuals_active"]
     return avatar.eval()
 
 

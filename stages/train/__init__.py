@@ -5,12 +5,13 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=1,
+    version=2,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={
-        "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json"),
+        "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json", "footage.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
     },
+    assets=lambda settings: ("lpips",) if settings.lpips else (),
     reads_body=True,
 )

@@ -28,11 +28,13 @@ class View:
         color: [H, W, 3] in [0, 1], the whole picture, not only the person.
         alpha: [H, W] in [0, 1], the person's soft mask.
         camera: of the crop.
+        generated: whether a model made the picture; its losses then weigh less.
     """
 
     color: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     camera: Camera
+    generated: bool = False
 
     def composite(self, background: Tensor) -> Tensor:
         """The person over a plain background, [3] -> [H, W, 3]."""
@@ -53,15 +55,22 @@ class Box:
 class Frames:
     """Crops of numbered frames, kept in memory as far as it is reasonable."""
 
-    def __init__(self, folder: Path, cameras: Mapping[int, Camera], box: Box | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        cameras: Mapping[int, Camera],
+        box: Box | None = None,
+        generated: frozenset[int] = frozenset(),
+    ):
         """Reads nothing yet.
 
         Args:
             folder: what ingest published.
             cameras: of every frame.
             box: the part of each frame to return; the whole frame if None.
+            generated: the frames that a model made.
         """
-        self.folder, self.cameras, self.box = folder, cameras, box
+        self.folder, self.cameras, self.box, self.generated = folder, cameras, box, generated
         camera = next(iter(cameras.values()))
         pixels = (box.right - box.left) * (box.bottom - box.top) if box else camera.width * camera.height
         self._read = functools.lru_cache(maxsize=max(1, CACHED_BYTES // (4 * pixels)))(self._load)
@@ -72,7 +81,8 @@ class Frames:
         box, camera = self.box, self.cameras[frame]
         if box is not None:
             camera = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
-        return View(torch.from_numpy(color).float() / 255, torch.from_numpy(alpha).float() / 255, camera)
+        picture, mask = torch.from_numpy(color).float() / 255, torch.from_numpy(alpha).float() / 255
+        return View(picture, mask, camera, frame in self.generated)
 
     def _load(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         color, alpha = read_frame(self.folder / "frames", frame), read_mask(self.folder / "masks", frame)

@@ -5,23 +5,22 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
-from pipeline.avatar import Avatar, Decoded, Posed
-from pipeline.avatar.canonical import HANDS
+from pipeline.avatar import Avatar
+from pipeline.curves import Curve
 from pipeline.errors import UserError
+from pipeline.metrics import Lpips
 from pipeline.metrics.image import psnr
 from pipeline.splat import render
-from stages.train import losses, schedule
+from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
-from pipeline.curves import Curve
 from stages.train.data import Frames
+from stages.train.objective import Evidence, Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
-Terms = dict[str, Tensor]
 
 
 class Trainer:
@@ -38,21 +37,21 @@ class Trainer:
         self,
         avatar: Avatar,
         poses: PoseRefinement,
-        views: Frames,
-        frames: tuple[int, ...],
+        evidence: Evidence,
         settings: TrainSettings,
+        network: Lpips | None = None,
     ):
         """Starts at iteration 0.
 
         Args:
             avatar: untrained.
             poses: fitted.
-            views: crops of the training frames.
-            frames: the training frames' numbers.
+            evidence: the training frames.
             settings: of the stage.
+            network: LPIPS, if it has a weight.
         """
         self.avatar, self.poses, self.settings = avatar, poses, settings
-        self.views, self.frames = views, frames
+        self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
         self.curve, self.iteration = Curve(), 0
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
         self._update_phase()
@@ -64,7 +63,7 @@ class Trainer:
             UserError: if a term is not finite; nothing has been changed then.
         """
         self._update_phase()
-        terms = self._objective()
+        terms = self.objective(self.iteration, self.level, self._poses_move())
         values = {name: float(term.detach()) for name, term in terms.items()}
         for name, value in values.items():
             if not math.isfinite(value):
@@ -98,7 +97,8 @@ class Trainer:
             decoded = self.avatar.decode(self.level)
             for frame in frames:
                 view, pose = views[frame], self.poses.fitted(frame)
-                posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl)
+                time = self.evidence.times.get(frame)
+                posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, time=time)
                 color = render(posed.gaussians, view.camera).color
                 values.append(psnr(color.clamp(0, 1), view.composite(torch.zeros(3))))
         return sum(values) / len(values)
@@ -142,68 +142,12 @@ class Trainer:
 
     def _update_phase(self) -> None:
         settings = self.settings
-        late = settings.pose_heads_from < 1
-        self.avatar.pose_heads_active = late and schedule.reached(
-            settings, settings.pose_heads_from, self.iteration
-        )
+        self.avatar.pose_heads_active = schedule.begun(settings, settings.pose_heads_from, self.iteration)
+        self.avatar.residuals_active = schedule.begun(settings, settings.residual_from, self.iteration)
         factor = schedule.rate_factor(settings, self.iteration)
         for optimizer in (self._avatar_optimizer, self._pose_optimizer):
             for group in optimizer.param_groups:
                 group["lr"] = group["base_rate"] * factor
-
-    def _objective(self) -> Terms:
-        """The weighted terms of this iteration, averaged over its frames."""
-        decoded = self.avatar.decode(self.level)
-        per_frame = [self._frame_terms(decoded, place) for place in range(self.settings.batch)]
-        terms = {name: torch.stack([one[name] for one in per_frame]).mean() for name in per_frame[0]}
-        return {**terms, **self._static_terms(decoded)}
-
-    def _frame_terms(self, decoded: Decoded, place: int) -> Terms:
-        settings = self.settings
-        position = self.iteration * settings.batch + place
-        frame = schedule.drawn_frame(settings.seed, self.frames, position)
-        background = schedule.drawn_background(settings.seed, position)
-        view = self.views[frame]
-        pose = self.poses(frame) if self._poses_move() else self.poses.fitted(frame)
-        noise = self._pose_noise(position)
-        posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, noise)
-        rendering = render(posed.gaussians, view.camera)
-        image, target = losses.over(rendering.color, rendering.alpha, background), view.composite(background)
-        terms = {
-            "l1": settings.l1 * losses.l1(image, target),
-            "ssim": settings.ssim * losses.ssim(image, target),
-            **self._posed_terms(decoded, posed),
-        }
-        if settings.pose_change and self._poses_move():
-            terms["pose_change"] = settings.pose_change * self.poses.change(frame)
-        return terms
-
-    def _pose_noise(self, position: int) -> Tensor:
-        settings, length = self.settings, 6 * (self.poses.poses.rotation.shape[1] - 1)
-        return settings.pose_noise * schedule.drawn_noise(settings.seed, position, length)
-
-    def _posed_terms(self, decoded: Decoded, posed: Posed) -> Terms:
-        settings, neighbours, gaussians = self.settings, decoded.surface.neighbours, posed.gaussians
-        terms = {
-            "laplacian_scale": settings.laplacian_scale * losses.laplacian(posed.log_scale, neighbours),
-            "laplacian_color": settings.laplacian_color * losses.laplacian(gaussians.colors, neighbours),
-            "scale_size": settings.scale_size * losses.size(gaussians.scales),
-        }
-        if posed.pose_offset is not None:
-            smoothness = losses.laplacian(posed.pose_offset, neighbours)
-            terms["laplacian_pose_offset"] = settings.laplacian_offset * smoothness
-            terms["pose_offset"] = settings.pose_offset * losses.size(posed.pose_offset)
-        return terms
-
-    def _static_terms(self, decoded: Decoded) -> Terms:
-        settings, offset = self.settings, decoded.offset
-        hands = decoded.surface.canonical.is_part(*HANDS)
-        smoothness = losses.laplacian(offset, decoded.surface.neighbours)
-        return {
-            "laplacian_offset": settings.laplacian_offset * smoothness,
-            "offset": settings.offset * losses.size(offset),
-            "hand_offset": settings.hand_offset * losses.size(offset, hands),
-        }
 
 
 def _optimizers(

@@ -59,25 +59,74 @@ def over(color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
     return color + (1 - alpha)[..., None] * background
 
 
-def laplacian(values: Tensor, neighbours: SparsePair) -> Tensor:
+def trust(alpha: Tensor, band: int) -> Tensor:
+    """How far a mask is to be believed at each pixel, [H, W] -> [H, W] in [0, 1].
+
+    ``1 - 4 a (1 - a)``, one minus the scaled variance of a coin with the mask's mean a over the
+    surrounding square: 0 on the silhouette, 1 where all of the square agrees.
+
+    Args:
+        alpha: [H, W], a soft mask.
+        band: pixels on either side of the silhouette that are in doubt; the square has
+            ``2 band + 1`` pixels a side.
+    """
+    mean = functional.avg_pool2d(alpha[None], 2 * band + 1, 1, band, count_include_pad=False)[0]
+    return 1 - 4 * mean * (1 - mean)
+
+
+def believed(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """The image moved towards the target where the target is in doubt, [H, W, 3].
+
+    Compared with the target, its L1 is the weighted L1, and SSIM and LPIPS see agreement where there
+    is nothing to be believed. No gradient reaches the image where the weight is 0.
+
+    Args:
+        image, target: [H, W, 3].
+        weight: [H, W] in [0, 1].
+    """
+    return target + weight[..., None] * (image - target)
+
+
+def laplacian(values: Tensor, neighbours: SparsePair, weight: Tensor | float = 1.0) -> Tensor:
     """Mean squared uniform Laplacian of per-vertex values, [N, C] -> scalar.
 
     Args:
         values: [N, C].
         neighbours: [N, N], the mean over each vertex's neighbours. A vertex without neighbours has
             the mean 0, so that its own value is what is penalised.
+        weight: of each vertex's square, [N, 1] or a number.
     """
-    return (values - neighbours @ values).square().mean()
+    return (weight * (values - neighbours @ values).square()).mean()
 
 
-def size(values: Tensor, chosen: Tensor | None = None) -> Tensor:
-    """Mean square of per-vertex values, [N, C] -> scalar, over the chosen vertices alone if given.
+def size(values: Tensor, weight: Tensor | float = 1.0) -> Tensor:
+    """Mean square of per-vertex values, [N, C] -> scalar, each weighted by [N, 1] or a number."""
+    return (weight * values.square()).mean()
+
+
+def growth(log_scale: Tensor) -> Tensor:
+    """Mean square of what scales have grown beyond their initial values, [N, 3] logarithms -> scalar.
+
+    Shrinking costs nothing here and gains nothing: a penalty on the size itself draws in what no
+    frame holds open, and leaves gaps in views that training never had.
+    """
+    return log_scale.clamp_min(0).square().mean()
+
+
+def outward(offset: Tensor, normals: Tensor, softness: float = 1e-3) -> Tensor:
+    """How far offsets point outwards, mean of ``max(n . offset / |offset|, 0)`` (ExAvatar's hands).
+
+    Masks bleed around fingers; without it hands swell to fill them.
 
     Args:
-        values: [N, C].
-        chosen: [N] bool; the result is 0 where it chooses none.
+        offset: [M, 3], metres.
+        normals: [M, 3], unit, outward.
+        softness: metres under which an offset has no full direction yet: 0 has no gradient to offer.
     """
-    if chosen is None:
-        return values.square().mean()
-    count = int(chosen.sum()) * values.shape[1]
-    return (values.square() * chosen[:, None]).sum() / max(count, 1)
+    direction = offset / (offset.square().sum(1, keepdim=True) + softness**2).sqrt()
+    return (normals * direction).sum(1).clamp_min(0).mean()
+
+
+def spread_of_color(colors: Tensor) -> Tensor:
+    """Mean squared difference of colours from their mean, which gets no gradient: [M, 3] -> scalar."""
+    return (colors - colors.mean(0).detach()).square().mean()

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from pipeline.avatar import Architecture, Avatar, save_avatar
+from pipeline.avatar import Architecture, Avatar, Canonical, save_avatar
+from pipeline.avatar.residual import part_rows
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
 from pipeline.errors import UserError
-from pipeline.records import Split, read_cameras, read_split
+from pipeline.metrics import Lpips
+from pipeline.records import Split, read_cameras, read_footage, read_split
 from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.data import Frames, person_box, spread
 from stages.train.loop import Trainer, describe, point_values
+from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility import Visibility, first_colors, measure, write_visibility
@@ -32,6 +37,7 @@ class Inputs:
         split: the frames to learn from and those held out.
         crops: training frames around the person.
         whole: uncropped frames.
+        times: seconds of frames from the clip's start, of all that have a time.
     """
 
     body: BodyModel
@@ -40,6 +46,11 @@ class Inputs:
     split: Split
     crops: Frames
     whole: Frames
+    times: Mapping[int, float]
+
+    def evidence(self, texture: Tensor | None) -> Evidence:
+        """The training frames, and the mean colours that they show, [N, 3]."""
+        return Evidence(self.crops, self.split.train, self.times, texture)
 
 
 def run(context: Context) -> None:
@@ -61,12 +72,12 @@ def train_subject(context: Context) -> None:
     inputs, settings = read_inputs(context), context.settings
     refinement = PoseRefinement(inputs.poses, inputs.split.train)
     started = time.monotonic()
-    avatar, visibility = prepare(inputs, refinement, settings, context)
-    trainer = Trainer(avatar, refinement, inputs.crops, inputs.split.train, settings)
+    avatar, visibility, texture = prepare(inputs, refinement, settings, context)
+    network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
+    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network)
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()
-    trainer.avatar.pose_heads_active = settings.pose_heads_from < 1
     save_avatar(context.output / "avatar.safetensors", trainer.avatar)
     write_poses(context.output / "poses.parquet", refinement.refined())
     write_visibility(context.output / "visibility.parquet", visibility)
@@ -91,13 +102,19 @@ def read_inputs(context: Context) -> Inputs:
         split=split,
         crops=Frames(ingest, cameras, box),
         whole=Frames(ingest, cameras),
+        times=dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False)),
     )
 
 
 def prepare(
     inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context
-) -> tuple[Avatar, Visibility]:
-    """The untrained avatar: what to keep of the body, and its first colours."""
+) -> tuple[Avatar, Visibility, Tensor | None]:
+    """The untrained avatar: what to keep of the body, and its first colours.
+
+    Returns:
+        The avatar, what the clip shows of the body, and the texture of the face loss, [N, 3]; None
+        where it has no weight.
+    """
     chosen = spread(inputs.split.train, settings.gate_frames)
     everything = torch.arange(len(inputs.body.v_template))
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0, scale=settings.scale)
@@ -109,23 +126,48 @@ def prepare(
     if not settings.gate:
         visibility = dataclasses.replace(visibility, kept=torch.ones_like(visibility.kept))
     kept = torch.nonzero(visibility.kept)[:, 0]
-    sizes = architecture(settings)
+    sizes = architecture(settings, seen_parts(body.surfaces[0].canonical, visibility, settings))
     avatar = Avatar(inputs.body, inputs.identity, kept, sizes, settings.seed, settings.half_precision)
-    avatar.pose_heads_active = False
+    avatar.pose_heads_active = avatar.residuals_active = False
+    set_time_range(avatar, inputs)
     seen = float((visibility.frames > 0).float().mean())
     context.log(
         f"{seen:.0%} of the body is seen, {len(kept)} of {len(everything)} vertices are kept, "
-        f"{len(avatar)} Gaussians"
+        f"{len(avatar)} Gaussians; residual colours of: {', '.join(sizes.residual_parts) or 'no part'}"
     )
-    if settings.initial_color:
-        avatar.base_color.copy_(first_colors(avatar.eval(), refinement, inputs.crops, chosen))
-    return avatar.train(), visibility
+    texture = None
+    if settings.initial_color or settings.face:
+        logits = first_colors(avatar.eval(), refinement, inputs.crops, chosen, settings.mask_band)
+        texture = torch.sigmoid(logits) if settings.face else None
+        if settings.initial_color:
+            avatar.base_color.copy_(logits)
+    return avatar.train(), visibility, texture
 
 
-def architecture(settings: TrainSettings) -> Architecture:
+def seen_parts(canonical: Canonical, visibility: Visibility, settings: TrainSettings) -> tuple[str, ...]:
+    """The parts that get a residual head: of those wanted, the ones that the clip shows enough of."""
+    if settings.residual_from == 1:
+        return ()
+    seen = visibility.frames > 0
+    shares = {
+        part: float(seen[rows].float().mean())
+        for part, rows in part_rows(canonical, settings.residual_parts).items()
+    }
+    return tuple(part for part, share in shares.items() if 0 < share >= settings.residual_seen)
+
+
+def set_time_range(avatar: Avatar, inputs: Inputs) -> None:
+    """Tells the avatar's residual heads when the training frames were filmed."""
+    times = [inputs.times[frame] for frame in inputs.split.train if frame in inputs.times]
+    if times:
+        avatar.residuals.time_range.copy_(torch.tensor([min(times), max(times)]))
+
+
+def architecture(settings: TrainSettings, residual_parts: tuple[str, ...]) -> Architecture:
     """The part of the settings that an avatar's file has to remember."""
     names = [field.name for field in dataclasses.fields(Architecture)]
-    return Architecture(**{name: getattr(settings, name) for name in names})
+    remembered = {name: getattr(settings, name) for name in names}
+    return Architecture(**{**remembered, "residual_parts": residual_parts})
 
 
 def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:

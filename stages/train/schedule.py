@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.train.settings import TrainSettings
 
-FRAMES, BACKGROUND, POSE_NOISE = 1, 2, 3  # purposes
+FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP = 1, 2, 3, 4, 5  # purposes
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
@@ -27,8 +27,13 @@ def rate_factor(settings: TrainSettings, iteration: int) -> float:
 
 
 def reached(settings: TrainSettings, fraction: float, iteration: int) -> bool:
-    """Whether the run has come as far as ``fraction``; never for a fraction of 1."""
+    """Whether the run has come as far as ``fraction``."""
     return iteration >= fraction * settings.iterations
+
+
+def begun(settings: TrainSettings, fraction: float, iteration: int) -> bool:
+    """Whether something that starts at ``fraction`` of the run takes part; 1 stands for never."""
+    return fraction < 1 and reached(settings, fraction, iteration)
 
 
 def drawn_frame(seed: int, frames: tuple[int, ...], position: int) -> int:
@@ -45,6 +50,11 @@ def _order(seed: int, count: int, epoch: int) -> np.ndarray:
 def drawn_background(seed: int, position: int) -> Tensor:
     """A uniformly random colour, [3]."""
     return torch.from_numpy(np.random.default_rng([seed, BACKGROUND, position]).random(3, np.float32))
+
+
+def drawn_share(seed: int, purpose: int, position: int) -> float:
+    """A uniformly random number in [0, 1)."""
+    return float(np.random.default_rng([seed, purpose, position]).random())
 
 
 def drawn_noise(seed: int, position: int, size: int) -> Tensor:

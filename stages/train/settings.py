@@ -6,6 +6,30 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+# Written out, because settings are read where torch is not imported; tests compare them with the
+# originals in pipeline/avatar/residual.py and pipeline/metrics/lpips.py.
+NETWORKS = ("alex", "vgg")
+PLACES = ("canonical", "posed")
+PARTS = (
+    "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg",
+    "rest",
+)  # fmt: skip
+COUNTS = (
+    "iterations", "batch", "held_out_every", "checkpoint_every", "gate_frames", "groups", "lpips_every",
+)  # fmt: skip
+FRACTIONS = (
+    "subdivide_from", "pose_heads_from", "refine_from", "residual_from", "residual_seen", "time_dropout",
+    "final_rate",
+)  # fmt: skip
+AMOUNTS = (
+    "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "seed", "pose_noise",
+    "threads", "place_frequencies", "time_frequencies", "lpips_crop", "mask_band", "l1", "ssim", "lpips",
+    "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
+    "laplacian_scale_face", "laplacian_color", "laplacian_color_hands", "offset", "offset_hands",
+    "offset_face", "pose_offset", "hand_normal", "scale_size", "scale_size_hands", "scale_growth",
+    "hand_color", "arm_color", "residual_size", "pose_change",
+)  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
@@ -37,6 +61,16 @@ class TrainSettings:
     pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices
     initial_color: bool = True  # colours start at what the training frames show, else at grey
 
+    # Residual colours (Section 3.5). A part without a vertex that the gate saw gets no head.
+    residual_parts: tuple[str, ...] = ("face", "left_hand", "right_hand")  # "rest": the authors' fourth net
+    residual_from: float = 0.5  # fraction of the run from which the residual heads take part; 1: never
+    residual_width: int = 64  # hidden channels; the authors' release has 256
+    residual_place: str = "canonical"  # what they are told of a Gaussian's place; "posed": in the world
+    place_frequencies: int = 6  # of that place's encoding, in the part's box ("posed": metres)
+    time_frequencies: int = 6  # of the time's encoding, over the training frames' interval
+    time_dropout: float = 0.2  # share of draws without a time, for motion that has none
+    residual_seen: float = 0.1  # share of a part's vertices that the gate must see for it to get a head
+
     # Visibility gate
     gate: bool = True  # leave out what no training frame shows
     gate_frames: int = 24  # training frames that the gate looks at
@@ -54,39 +88,55 @@ class TrainSettings:
     # Objective
     l1: float = 0.8  # lambda_L1
     ssim: float = 0.2  # lambda_ssim
-    laplacian_offset: float = 1e3  # smoothness of static and pose-dependent offsets
+    lpips: float = 0.0  # lambda_lpips; the paper's is 0.2
+    lpips_network: str = "alex"  # or "vgg", twenty times as dear on a CPU
+    lpips_every: int = 4  # drawn frames for one that LPIPS looks at, with as many times the weight
+    lpips_crop: int = 96  # pixels of the square around a random place of the person; 0: the whole view
+    face: float = 0.0  # lambda_face; the paper's is 0.8
+    generated: float = 0.1  # lambda_L1, lambda_ssim and lambda_lpips on generated frames
+    mask_band: int = 0  # pixels on either side of the silhouette where the mask is in doubt; 0: believed
+
+    # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
+    laplacian_offset: float = 1e3  # smoothness of static and of all offsets together
+    laplacian_offset_face: float = 1e3  # the same on the face
     laplacian_scale: float = 0.02  # smoothness of log scales
+    laplacian_scale_face: float = 0.02  # the same on the face
     laplacian_color: float = 0.002  # smoothness of colours
-    offset: float = 10.0  # size of static offsets
-    hand_offset: float = 200.0  # size of static offsets on the hands
-    pose_offset: float = 50.0  # size of pose-dependent offsets
-    scale_size: float = 50.0  # size of scales
+    laplacian_color_hands: float = 0.002  # the same on the hands
+    offset: float = 10.0  # size of static offsets, metres squared
+    offset_hands: float = 1000.0  # the same on the hands
+    offset_face: float = 10.0  # the same on the face
+    pose_offset: float = 50.0  # size of pose-dependent offsets, metres squared
+    hand_normal: float = 0.0  # static offsets of the hands that point outwards
+    scale_size: float = 0.0  # size of scales, metres squared
+    scale_size_hands: float = 0.0  # the same on the hands
+    scale_growth: float = 0.002  # log scales above the initial ones
+    hand_color: float = 0.0  # differences of the hands' colours from their mean
+    arm_color: float = 0.0  # differences of the arms' lower sides from their upper sides
+    residual_size: float = 1e-3  # size of residual colours, in logits
     pose_change: float = 0.0  # distance of refined poses from the fitted ones
+
     crop_margin: int = 8  # pixels around the person that the losses see
 
     def __post_init__(self) -> None:
         """Refuses values that cannot work."""
-        counts = ("iterations", "batch", "held_out_every", "checkpoint_every", "gate_frames", "groups")
-        fractions = ("subdivide_from", "pose_heads_from", "refine_from", "final_rate")
-        amounts = (
-            "held_out_frames",
-            "gate_rings",
-            "warm_up",
-            "crop_margin",
-            "learning_rate",
-            "seed",
-            "pose_noise",
-            "threads",
-        )
-        self._require(counts, lambda value: value >= 1, "be at least 1")
-        self._require(fractions, lambda value: 0 <= value <= 1, "lie between 0 and 1")
-        self._require(amounts, lambda value: value >= 0, "not be negative")
+        self._require(COUNTS, lambda value: value >= 1, "be at least 1")
+        self._require(FRACTIONS, lambda value: 0 <= value <= 1, "lie between 0 and 1")
+        self._require(AMOUNTS, lambda value: value >= 0, "not be negative")
         self._require(("subdivisions",), lambda value: value in (0, 1, 2), "be 0, 1 or 2")
         if self.subdivisions:
             self._require(("subdivide_from",), lambda value: value < 1, "be less than 1")
         self._require(("plane_resolution",), lambda value: value >= 2, "be at least 2")
         self._require(("groups",), lambda value: self.width % value == 0, f"divide train.width, {self.width}")
         self._require(("opacity",), lambda value: 0 < value < 1, "lie between 0 and 1")
+        self._require(
+            ("residual_width",), lambda value: value % self.groups == 0, "be divisible by train.groups"
+        )
+        self._require(("lpips_network",), lambda value: value in NETWORKS, f"be one of {', '.join(NETWORKS)}")
+        self._require(("residual_place",), lambda value: value in PLACES, f"be one of {', '.join(PLACES)}")
+        self._require(
+            ("residual_parts",), lambda value: {*value} <= {*PARTS}, f"hold only {', '.join(PARTS)}"
+        )
 
     def _require(self, names: tuple[str, ...], fits: Callable[[Any], bool], what: str) -> None:
         for name in names:

@@ -20,6 +20,7 @@ from pipeline.avatar.canonical import dilate
 from pipeline.splat import Gaussians, render
 from pipeline.tables import write_table
 from stages.train.data import Frames
+from stages.train.losses import trust
 from stages.train.poses import PoseRefinement
 
 SCHEMA = pa.schema(
@@ -79,12 +80,22 @@ def write_visibility(path: Path, visibility: Visibility) -> None:
     write_table(path, SCHEMA, columns)
 
 
-def first_colors(avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]) -> Tensor:
+def first_colors(
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int = 0
+) -> Tensor:
     """Logits of the mean colour that the chosen frames show at each Gaussian, [N, 3].
 
     The weights of that mean are the blending weights. They come from the renderer's own backward
     pass: the derivative of ``sum(rendering * picture)`` with respect to a Gaussian's colour is the
     sum of the pixels that it covers, each times its blending weight there.
+
+    Args:
+        avatar: untrained.
+        poses: of every frame.
+        views: the frames.
+        chosen: frame numbers.
+        band: pixels on either side of the silhouette where the mask is in doubt. What is seen there
+            alone takes its neighbours' colour, not that of the background which the mask may hold.
     """
     total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar), 1)
     for frame in chosen:
@@ -93,7 +104,8 @@ def first_colors(avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: t
             gaussians = _gaussians(avatar, poses, frame)
         colors = gaussians.colors.clone().requires_grad_()
         color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
-        person = (view.alpha > 0.5).float()[..., None]
+        believed = trust(view.alpha, band) if band else torch.ones_like(view.alpha)
+        person = (believed * (view.alpha > 0.5))[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
     neighbours = avatar.surfaces[-1].neighbours

@@ -6,6 +6,7 @@ import torch
 
 from pipeline.body import Poses, write_poses
 from pipeline.camera import facing_camera
+from pipeline.curves import Curve
 from pipeline.frames import write_frame, write_mask
 from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import Gaussians, render
@@ -14,7 +15,6 @@ from stages.evaluate.evidence import read_evidence
 from stages.evaluate.run import evaluate
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
-from pipeline.curves import Curve
 from stages.train.visibility import Visibility, write_visibility
 
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept

@@ -1,23 +1,28 @@
 """The train stage on a tiny synthetic subject: what it learns, resumes, publishes and refuses."""
 
 import dataclasses
+import shutil
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from pipeline import curves
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.errors import UserError
-from pipeline.frames import write_mask
+from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import curve, losses, visibility
+from stages.train import losses, visibility
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
 from stages.train.loop import Trainer
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
+READERS = ((read_frame, "frames"), (read_mask, "masks"))
+RED = np.array([255, 0, 0], np.uint8)
 PUBLISHED = {"avatar.safetensors", "curve.parquet", "poses.parquet", "visibility.parquet"}
 
 
@@ -39,8 +44,8 @@ def finished(subject):
 def trainer_for(context) -> Trainer:
     inputs = stage.read_inputs(context)
     refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
-    avatar, _ = stage.prepare(inputs, refinement, context.settings, context)
-    return Trainer(avatar, refinement, inputs.crops, inputs.split.train, context.settings)
+    avatar, _, texture = stage.prepare(inputs, refinement, context.settings, context)
+    return Trainer(avatar, refinement, inputs.evidence(texture), context.settings)
 
 
 def bytes_of(folder) -> dict[str, bytes]:
@@ -49,8 +54,9 @@ def bytes_of(folder) -> dict[str, bytes]:
 
 def test_publishes_everything_and_all_of_it_finite(finished):
     assert set(bytes_of(finished)) == PUBLISHED
-    rows = read_table(finished / "curve.parquet", curve.SCHEMA, "")
-    assert {"l1", "ssim", "laplacian_offset", "psnr", "gaussians"} <= set(rows["name"])
+    rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")
+    expected = {"l1", "ssim", "face", "laplacian_offset", "residual_size", "psnr", "gaussians"}
+    assert expected <= set(rows["name"])
     assert set(rows["iteration"]) == {6, 12}
 
 
@@ -147,6 +153,25 @@ def test_first_colors_are_near_the_truth(subject, tmp_path):
     assert trainer.held_out(inputs.whole, frames) > grey.held_out(inputs.whole, frames) + 5
 
 
+def test_first_colours_leave_out_what_a_wide_mask_takes_from_the_background(subject, tmp_path):
+    shutil.copytree(subject / "ingest", tmp_path / "ingest")
+    (tmp_path / "fit").symlink_to(subject / "fit")
+    for frame in range(6):
+        picture, mask = (read(tmp_path / "ingest" / name, frame) for read, name in READERS)
+        write_frame(tmp_path / "ingest" / "frames", frame, np.where(mask[..., None] < 64, RED, picture))
+        write_mask(tmp_path / "ingest" / "masks", frame, cv2.dilate(mask, np.ones((5, 5), np.uint8)))
+    reddened = []
+    for band in (0, 3):
+        context = context_for(tmp_path, tmp_path / f"out{band}", mask_band=band)
+        inputs = stage.read_inputs(context)
+        refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
+        avatar, seen, _ = stage.prepare(inputs, refinement, context.settings, context)
+        truth = torch.sigmoid(2 * torch.sin(9 * inputs.body.v_template[avatar.kept]))
+        change = (torch.sigmoid(avatar.base_color) - truth)[seen.frames[avatar.kept] > 0]
+        reddened.append(float((change[:, 0] - change[:, 1:].mean(1)).mean()))
+    assert 0.002 < reddened[0] and abs(reddened[1]) < 0.5 * reddened[0]
+
+
 def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
     table = read_table(finished / "visibility.parquet", visibility.SCHEMA, "")
     seen, kept = table["frames"] > 0, table["kept"]
@@ -182,12 +207,33 @@ def test_published_avatar_renders_the_held_out_frame(subject, finished):
     view = inputs.whole[5]
     with torch.no_grad():
         pose = inputs.poses
-        gaussians = avatar.gaussians(pose.rotation[5], pose.expression[5], pose.transl[5])
+        gaussians = avatar.gaussians(pose.rotation[5], pose.expression[5], pose.transl[5], inputs.times[5])
         rendering = render(gaussians, view.camera)
     error = (rendering.color - view.composite(torch.zeros(3))).square().mean()
-    curve_rows = read_table(finished / "curve.parquet", curve.SCHEMA, "")
+    curve_rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")
     last = curve_rows["value"][(curve_rows["name"] == "psnr") & (curve_rows["iteration"] == 12)]
     assert -10 * torch.log10(error) == pytest.approx(float(last[0]), abs=0.05)
+
+
+def test_published_avatar_has_learnt_residuals_of_what_is_seen(finished):
+    avatar = load_avatar(finished / "avatar.safetensors", load_body(BODY_FILE))
+    assert list(avatar.residuals.heads) == ["face"]  # the hands hang below the picture
+    assert avatar.residuals_active and avatar.pose_heads_active
+    torch.testing.assert_close(avatar.residuals.time_range, torch.tensor([0.5, 0.9]))
+    assert bool((avatar.residuals.heads["face"].last.weight != 0).any())
+
+
+def test_residuals_can_be_left_out(subject, tmp_path):
+    trainer = trainer_for(context_for(subject, tmp_path / "never", residual_from=1.0))
+    assert not trainer.avatar.residuals.heads
+    assert "residual_size" not in trainer.step()
+    unseen = trainer_for(context_for(subject, tmp_path / "unseen", residual_seen=1.0))
+    assert not unseen.avatar.residuals.heads
+
+
+def test_residuals_begin_when_they_are_told_to(subject, tmp_path):
+    trainer = trainer_for(context_for(subject, tmp_path / "out", residual_from=0.25))
+    assert ["residual_size" in trainer.step() for _ in range(5)] == [False, False, False, True, True]
 
 
 def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from pipeline.avatar import Architecture, Avatar
 from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
 from pipeline.camera import facing_camera
 from pipeline.frames import write_frame, write_mask
-from pipeline.records import Split, write_cameras, write_split
+from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import render
 from stages.train.settings import TrainSettings
 
@@ -31,6 +31,9 @@ TINY = TrainSettings(
     groups=4,
     subdivisions=0,
     gate_frames=3,
+    residual_from=0.3,
+    face=0.8,
+    mask_band=1,
 )
 
 
@@ -65,6 +68,9 @@ def write_subject(folder: Path) -> None:
         write_frame(ingest / "frames", frame, (over_grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
         write_mask(ingest / "masks", frame, (rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8))
     write_cameras(ingest / "cameras.parquet", {frame: camera for frame in poses.frames})
+    seconds = tuple(0.5 + frame / 10 for frame in poses.frames)
+    footage = Footage("made", WIDTH, HEIGHT, 10.0, 1.0, FRAMES, FRAMES, {}, 1, seconds, {})
+    write_footage(ingest / "footage.json", footage)
     write_split(ingest / "split.json", Split(train=poses.frames[:-1], test=poses.frames[-1:]))
     write_identity(fit / "identity.safetensors", identity, body)
     write_poses(fit / "poses.parquet", poses)

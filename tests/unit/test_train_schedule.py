@@ -22,8 +22,8 @@ def test_rate_rises_then_falls_to_its_last_factor():
 
 @pytest.mark.parametrize(("fraction", "first"), [(0.0, 0), (0.4, 40), (1.0, None)])
 def test_fraction_of_the_run(fraction, first):
-    reached = [schedule.reached(SETTINGS, fraction, iteration) for iteration in range(100)]
-    assert reached == [first is not None and iteration >= first for iteration in range(100)]
+    begun = [schedule.begun(SETTINGS, fraction, iteration) for iteration in range(100)]
+    assert begun == [first is not None and iteration >= first for iteration in range(100)]
 
 
 def test_every_frame_is_drawn_once_an_epoch_in_changing_order():

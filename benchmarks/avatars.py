@@ -1,0 +1,109 @@
+"""What the avatar's benchmarks are run on: an avatar of a given size on the open body, poses and frames."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Architecture, Avatar
+from pipeline.body import BodyModel, load_body, mean_identity, subdivide
+from pipeline.camera import Camera, facing_camera
+from pipeline.workspace import REPOSITORY
+
+TRANSL = (0.0, 0.41, -3.0)  # metres: the middle of the open body, three metres before the camera
+LARGEST_LEVEL = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """One frame's pose: rotation [55, 3] radians, expression [E], transl [3] metres."""
+
+    rotation: Tensor  # [55, 3]
+    expression: Tensor  # [E]
+    transl: Tensor  # [3]
+
+    def values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The arguments of ``Avatar.pose`` and ``Avatar.gaussians``."""
+        return self.rotation, self.expression, self.transl
+
+
+def open_body() -> BodyModel:
+    """The body of the repository."""
+    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
+
+
+def avatar_of(count: int, architecture: Architecture | None = None, half_precision: bool = True) -> Avatar:
+    """An avatar of about ``count`` Gaussians whose every head has a say, as after some training.
+
+    The least subdivision that reaches the count is taken, and the uppermost vertices of the body are kept, as
+    of a clip that does not show the feet.
+
+    Args:
+        count: of Gaussians; it is met to a hundredth.
+        architecture: sizes; the paper's if None. ``subdivisions`` is overridden.
+        half_precision: whether the heads run in bfloat16.
+
+    Raises:
+        ValueError: if the body subdivided twice has fewer vertices.
+    """
+    body = open_body()
+    level, kept = _kept(body, count)
+    sizes = dataclasses.replace(architecture or Architecture(), subdivisions=level)
+    avatar = Avatar(body, mean_identity(body), kept, sizes, half_precision=half_precision)
+    _awaken(avatar)
+    return avatar
+
+
+def poses_of(avatar: Avatar, count: int, seed: int = 0) -> list[Pose]:
+    """Random poses, each a little different from rest, before ``avatar_camera``."""
+    generator = torch.Generator().manual_seed(seed)
+    expressions = avatar.surfaces[-1].canonical.expression_directions.shape[-1]
+    return [
+        Pose(
+            0.12 * torch.randn(55, 3, generator=generator),
+            torch.randn(expressions, generator=generator),
+            torch.tensor(TRANSL),
+        )
+        for _ in range(count)
+    ]
+
+
+def avatar_camera(size: int) -> Camera:
+    """A camera that shows the whole open body in ``size`` x ``size`` pixels."""
+    return facing_camera(size, size, focal=1.45 * size)
+
+
+def _kept(body: BodyModel, count: int) -> tuple[int, Tensor]:
+    """The level of subdivision and the sorted body vertices that give about ``count`` Gaussians."""
+    for level in range(LARGEST_LEVEL + 1):
+        if _subdivided(body, torch.arange(len(body.v_template)), level) >= count:
+            break
+    else:
+        raise ValueError(f"the body has no {count} vertices, however it is subdivided")
+    topmost = body.v_template[:, 1].argsort(descending=True)
+    low, high = 1, len(topmost)
+    while high - low > max(1, len(topmost) // 1000):
+        middle = (low + high) // 2
+        enough = _subdivided(body, topmost[:middle], level) >= count
+        low, high = (low, middle) if enough else (middle, high)
+    return level, topmost[:high].sort().values
+
+
+def _subdivided(body: BodyModel, kept: Tensor, level: int) -> int:
+    """How many vertices the kept part of the body has after subdivision."""
+    new_index = torch.full((len(body.v_template),), -1)
+    new_index[kept] = torch.arange(len(kept))
+    faces = new_index[body.faces]
+    _, (marks,) = subdivide(faces[(faces >= 0).all(1)], torch.zeros(len(kept), 1), levels=level)
+    return len(marks)
+
+
+def _awaken(avatar: Avatar) -> None:
+    """Moves what starts at zero a little away from it, always alike."""
+    generator = torch.Generator().manual_seed(1)
+    avatar.base_color.copy_(torch.randn(avatar.base_color.shape, generator=generator))
+    for name, parameter in sorted(avatar.named_parameters()):
+        amount = 0.2 if name.startswith("triplane") else 0.02
+        parameter.data += amount * torch.randn(parameter.shape, generator=generator)

@@ -1,0 +1,319 @@
+"""A finished avatar with everything that does not depend on the pose computed once and for all.
+
+``Avatar.gaussians`` decodes the static part once, too. Baking goes on from there: the features are gone, and
+in their place stands what the first layer of each pose head makes of them, ``W_f f_i + b``; static offsets
+are part of the rest shape; of the skinning weights and the expressions only what is not zero is kept; and
+neither the triplane nor the body model is needed any more. Posing has no gradient.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import roma
+import safetensors
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decoded, pose_features
+from pipeline.avatar.fused import Layers, arranged, arranged_rows, finish
+from pipeline.avatar.heads import Head
+from pipeline.avatar.posing import Rig
+from pipeline.avatar.residual import encode
+from pipeline.body import joint_transforms
+from pipeline.errors import UserError
+from pipeline.splat import Gaussians
+
+FORMAT = "flexiavatar-baked-1"
+HEADS = ("geometry", "color")
+PLAIN = ("opacity", "place_frequencies", "time_frequencies", "posed_place")  # fields that JSON holds
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedHead:
+    """A head whose first layer is done as far as it can be.
+
+    Attributes:
+        products: [N, C], ``W_f f_i + b``, in the precision that the head runs in.
+        condition: [C, P] float32, what the shared vector is multiplied with.
+        own: [E, C] float32, what a point's own further inputs are multiplied with.
+        layers: the others, arranged (see ``fused.py``).
+    """
+
+    products: Tensor  # [N, C]
+    condition: Tensor  # [C, P]
+    own: Tensor  # [E, C]
+    layers: Layers
+
+    def __call__(self, shared: Tensor, own: Tensor | None = None) -> Tensor:
+        """Decodes a shared vector [P] and each point's own inputs [N, E] to [N, outputs] float32."""
+        own = torch.zeros(len(self.products), 0) if own is None else own
+        return finish(self.products, self.condition @ shared, (own, self.own), self.layers).float()
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedResidual:
+    """One part's residual colours.
+
+    Attributes:
+        rows: [M] int64, which Gaussians.
+        head: of the part; its products are those of the encoded places, where these do not change.
+    """
+
+    rows: Tensor  # [M]
+    head: BakedHead
+
+
+@dataclasses.dataclass(frozen=True)
+class Constants:
+    """What every pose needs of the body and of the static heads.
+
+    Attributes:
+        points: [N, 3], rest vertices and static offsets, metres.
+        expressive: [M] int64, the points that expressions move.
+        expressions: [M, 3, E], metres a unit of expression.
+        correctives: [N, 3, 486] bfloat16, the body's pose correctives; [0, 3, 486] if it has none.
+        scales: [N, 3], standard deviations before they change with the pose's log scales, metres.
+        log_scale, color_logit: [N, 3], of the static heads.
+        offset_unit: [N, 1], metres that a pose head's output of 1 stands for.
+        joints: [55, 3], metres.
+    """
+
+    points: Tensor
+    expressive: Tensor
+    expressions: Tensor
+    correctives: Tensor
+    scales: Tensor
+    log_scale: Tensor
+    color_logit: Tensor
+    offset_unit: Tensor
+    joints: Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedAvatar:
+    """An avatar that can be posed and nothing else.
+
+    Attributes:
+        constants: of the body and of the static heads.
+        rig: of the mesh.
+        parents: of the joints, -1 for the root.
+        opacity: of every Gaussian.
+        geometry, color: the pose heads; None if the avatar has none that are active.
+        residuals: the parts' residual colours.
+        time_range: [2], seconds of the first and the last training frame.
+        place_frequencies, time_frequencies: of the residuals' encodings.
+        posed_place: whether the residuals are told posed centres: then nothing of them is baked.
+    """
+
+    constants: Constants
+    rig: Rig
+    parents: tuple[int, ...]
+    opacity: float
+    geometry: BakedHead | None
+    color: BakedHead | None
+    residuals: dict[str, BakedResidual]
+    time_range: Tensor
+    place_frequencies: int
+    time_frequencies: int
+    posed_place: bool
+
+    def __len__(self) -> int:
+        """The number of Gaussians."""
+        return len(self.constants.points)
+
+    @torch.no_grad()
+    def gaussians(
+        self, rotation: Tensor, expression: Tensor, transl: Tensor, time: float | None = None
+    ) -> Gaussians:
+        """The avatar in a pose, world coordinates; as ``Avatar.gaussians``, without gradient.
+
+        Args:
+            rotation: [55, 3] rotation vectors, radians.
+            expression: [E].
+            transl: [3], metres.
+            time: seconds from the clip's start, or None, for the residual colours.
+        """
+        constants, theta = self.constants, pose_features(rotation)
+        transforms = joint_transforms(rotation[None], constants.joints, self.parents)[0]
+        points = self._rest_shape(rotation, expression)
+        log_scale, color_logit = constants.log_scale, constants.color_logit
+        if self.geometry is not None and self.color is not None:
+            normals = self.rig.normals(transforms, points)
+            change = self.geometry(theta)
+            points = torch.addcmul(points, change[:, :3], constants.offset_unit)
+            log_scale = log_scale + 0.5 * change[:, 3:]
+            color_logit = color_logit + self.color(theta, normals)
+        means, quaternions = self.rig.place(transforms, points, transl)
+        scales = constants.scales * log_scale.clamp(*LOG_SCALE_RANGE).exp_()
+        return Gaussians(
+            means=means,
+            quaternions=quaternions,
+            scales=scales.clamp_(max=LARGEST_SCALE),
+            colors=self._with_residuals(color_logit, means, theta, time).sigmoid(),
+            opacities=torch.full((len(points),), self.opacity),
+        )
+
+    def _rest_shape(self, rotation: Tensor, expression: Tensor) -> Tensor:
+        """The points before skinning, a copy: [N, 3]."""
+        constants = self.constants
+        moved = constants.expressions[..., : len(expression)] @ expression
+        points = constants.points.index_add(0, constants.expressive, moved)
+        if not len(constants.correctives):
+            return points
+        pose = (roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)).flatten()
+        return points + (constants.correctives @ pose.to(constants.correctives.dtype)).float()
+
+    def _with_residuals(self, logits: Tensor, means: Tensor, theta: Tensor, time: float | None) -> Tensor:
+        if not self.residuals:
+            return logits
+        condition = torch.cat([self._time_code(time), theta])
+        for part in self.residuals.values():
+            own = encode(means[part.rows], self.place_frequencies) if self.posed_place else None
+            logits = logits.index_add(0, part.rows, part.head(condition, own))
+        return logits
+
+    def _time_code(self, time: float | None) -> Tensor:
+        """As ``Residuals.time_code``."""
+        if time is None:
+            return torch.zeros(1 + 2 * self.time_frequencies)
+        first, last = self.time_range.unbind()
+        done = ((time - first) / (last - first).clamp_min(1e-6)).clamp(0, 1)
+        return encode(done[None], self.time_frequencies)
+
+
+@torch.no_grad()
+def bake(avatar: Avatar) -> BakedAvatar:
+    """Computes the pose-independent part of a finished avatar; the avatar is left as it is."""
+    decoded = avatar.decode()
+    surface, features = decoded.surface, decoded.features
+    kind = torch.bfloat16 if avatar.half_precision else torch.float32
+    heads: list[BakedHead | None] = [None, None]
+    if avatar.pose_heads_active:
+        heads = [
+            _baked_head(avatar.pose_geometry, features, kind),
+            _baked_head(avatar.pose_color, features, kind),
+        ]
+    residuals, networks = dict[str, BakedResidual](), avatar.residuals
+    posed = networks.place == "posed"
+    if avatar.residuals_active:
+        for region in surface.residual:
+            known = region.encoded[:, :0] if posed else region.encoded
+            residuals[region.part] = BakedResidual(
+                region.rows, _baked_head(networks.heads[region.part], known, kind)
+            )
+    return BakedAvatar(
+        constants=_constants(avatar, decoded),
+        rig=Rig.build(surface.canonical),
+        parents=surface.canonical.parents,
+        opacity=avatar.architecture.opacity,
+        geometry=heads[0],
+        color=heads[1],
+        residuals=residuals,
+        time_range=networks.time_range.clone(),
+        place_frequencies=networks.place_frequencies,
+        time_frequencies=networks.time_frequencies,
+        posed_place=posed,
+    )
+
+
+def _baked_head(head: nn.Module, points: Tensor, kind: torch.dtype) -> BakedHead:
+    """The head for given points [N, I]; inputs of the first layer beyond these I stay inputs."""
+    assert isinstance(head, Head) and head.condition is not None
+    layers = Layers.of([head.first, *head.hidden, head.last], list(head.norms))
+    ready, groups, known = arranged(layers, kind), layers.groups, points.shape[1]
+    first = arranged_rows(head.first.weight, groups)
+    products = torch.addmm(arranged_rows(head.first.bias, groups), points, first[:, :known].t())
+    # The first layer's own weights have done their work.
+    rest = dataclasses.replace(ready, weights=(ready.weights[0][:, :0], *ready.weights[1:]))
+    condition = arranged_rows(head.condition.weight, groups).contiguous()
+    return BakedHead(products.to(kind), condition, first[:, known:].t().contiguous(), rest)
+
+
+def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
+    canonical, sizes = decoded.surface.canonical, avatar.architecture
+    expressive = torch.nonzero(canonical.expression_directions.flatten(1).any(1))[:, 0]
+    correctives, across = canonical.pose_directions, canonical.spacing * sizes.scale
+    return Constants(
+        points=canonical.vertices + decoded.offset,
+        expressive=expressive,
+        expressions=canonical.expression_directions[expressive].contiguous(),
+        correctives=torch.zeros(0, 3, 0) if correctives is None else correctives.bfloat16(),
+        scales=torch.cat([across, across.mean(1, keepdim=True) * sizes.thickness], 1),
+        log_scale=decoded.log_scale.contiguous(),
+        color_logit=decoded.color_logit.contiguous(),
+        offset_unit=sizes.pose_offset_unit * decoded.surface.pliable,
+        joints=canonical.joints,
+    )
+
+
+def save_baked(path: Path, baked: BakedAvatar) -> None:
+    """Writes a baked avatar as one safetensors file; equal ones give equal bytes."""
+    tensors = {f"constants.{name}": value for name, value in vars(baked.constants).items()}
+    tensors |= {f"rig.{name}": value for name, value in vars(baked.rig).items()}
+    tensors["time_range"] = baked.time_range
+    heads = {name: getattr(baked, name) for name in HEADS if getattr(baked, name) is not None}
+    for part, residual in baked.residuals.items():
+        tensors[f"residual.{part}.rows"] = residual.rows
+        heads[f"residual.{part}"] = residual.head
+    for name, head in heads.items():
+        layers = enumerate(head.layers.flat())
+        tensors |= {f"{name}.{field}": getattr(head, field) for field in ("products", "condition", "own")}
+        tensors |= {f"{name}.layers.{place}": tensor for place, tensor in layers}
+    header = {
+        "format": FORMAT,
+        "parents": baked.parents,
+        "groups": {name: head.layers.groups for name, head in heads.items()},
+        **{name: getattr(baked, name) for name in PLAIN},
+    }
+    # One entry only: safetensors writes several in an order of its own, different in each process.
+    save_file(
+        {name: tensor.contiguous() for name, tensor in tensors.items()},
+        path,
+        {"baked": json.dumps(header, sort_keys=True)},
+    )
+
+
+def load_baked(path: Path) -> BakedAvatar:
+    """Reads a baked avatar; neither the avatar's own file nor a body model is needed.
+
+    Raises:
+        UserError: if the file is no baked avatar, or is damaged.
+    """
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("baked", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
+        raise UserError(f"{path} cannot be read ({error}); bake the avatar again") from error
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path} is not a baked avatar of this version; bake the avatar again")
+    heads = {name: _read_head(tensors, name, groups) for name, groups in header["groups"].items()}
+    parts = [name.removeprefix("residual.") for name in heads if name.startswith("residual.")]
+    return BakedAvatar(
+        constants=Constants(**_under("constants.", tensors)),
+        rig=Rig(**_under("rig.", tensors)),
+        parents=tuple(header["parents"]),
+        geometry=heads.get("geometry"),
+        color=heads.get("color"),
+        residuals={
+            part: BakedResidual(tensors[f"residual.{part}.rows"], heads[f"residual.{part}"]) for part in parts
+        },
+        time_range=tensors["time_range"],
+        **{name: header[name] for name in PLAIN},
+    )
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors whose name begins so, by the rest of it."""
+    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
+
+
+def _read_head(tensors: dict[str, Tensor], name: str, groups: int) -> BakedHead:
+    own = _under(f"{name}.", tensors)
+    flat = _under("layers.", own)
+    layers = Layers.from_flat(tuple(flat[str(place)] for place in range(len(flat))), groups)
+    return BakedHead(own["products"], own["condition"], own["own"], layers)

@@ -1,0 +1,101 @@
+"""The face loss: the registered face mesh in its mean texture against the frame (paper, Section 3.6).
+
+The texture is fixed: each vertex has the mean colour that the training frames show there. The mesh
+goes through the Gaussians' posed centres, so what the loss can move is geometry: offsets, pose,
+expression and translation. A face that slips over its texture costs, whatever the colour heads have
+learnt meanwhile. As in ExAvatar, the mesh is pasted into the picture: the error counts where the face
+covers it, and the mean is taken over the whole crop, so that the weight compares with L1's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Canonical
+from pipeline.body.mesh import face_normals, rasterize
+from pipeline.camera import Camera, project, to_camera
+
+
+@dataclasses.dataclass(frozen=True)
+class Pasted:
+    """The pixels that a textured mesh covers.
+
+    Attributes:
+        rows, columns: [P] int64.
+        color: [P, 3], differentiable with respect to the mesh's vertices.
+    """
+
+    rows: Tensor
+    columns: Tensor
+    color: Tensor
+
+
+def face_loss(pasted: Pasted, color: Tensor, alpha: Tensor) -> Tensor:
+    """The pasted face's absolute difference from a frame, a mean over all of the frame's values.
+
+    Args:
+        pasted: the face.
+        color: [H, W, 3] in [0, 1], the frame.
+        alpha: [H, W], the person's soft mask: a face behind something else is not compared.
+
+    Returns:
+        Scalar; 0 where no face is seen.
+    """
+    truth, person = color[pasted.rows, pasted.columns], alpha[pasted.rows, pasted.columns, None]
+    return ((pasted.color - truth).abs() * person).sum() / color.numel()
+
+
+def face_triangles(canonical: Canonical) -> Tensor:
+    """[F] bool: triangles whose three corners lie on the face."""
+    return canonical.is_part("face")[canonical.faces].all(1)
+
+
+def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, texture: Tensor) -> Pasted:
+    """What a camera sees of some triangles of a mesh.
+
+    Which triangle a pixel sees is found without gradient; the place on it is differentiable, so that
+    gradients are those of the texture sliding under the pixel. The outline's motion has none.
+
+    Args:
+        camera: the view.
+        vertices: [N, 3], metres, world.
+        faces: [F, 3] int64, the whole mesh: what is not chosen hides what lies behind it.
+        chosen: [F] bool.
+        texture: [N, 3], each vertex's colour.
+    """
+    raster = rasterize(camera, vertices, faces)
+    triangle = torch.from_numpy(raster.face).long()
+    shown = chosen & _facing(camera, vertices.detach(), faces)
+    rows, columns = torch.nonzero((triangle >= 0) & shown[triangle.clamp_min(0)], as_tuple=True)
+    corners = faces[triangle[rows, columns]]
+    seen = torch.cat([project(camera, vertices), to_camera(camera, vertices)[:, 2:]], 1)
+    # index_select: its gradient is an index_add, several times quicker than that of seen[corners].
+    weights = _barycentrics(seen.index_select(0, corners.flatten()).view(-1, 3, 3), rows, columns)
+    return Pasted(rows, columns, (weights[..., None] * texture[corners]).sum(1))
+
+
+def _facing(camera: Camera, vertices: Tensor, faces: Tensor) -> Tensor:
+    """[F] bool: triangles that show the camera their outside."""
+    in_camera = to_camera(camera, vertices)
+    return (face_normals(in_camera, faces) * in_camera[faces[:, 0]]).sum(1) < 0
+
+
+def _barycentrics(corners: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Where the pixels' rays meet their triangles, perspective-correct.
+
+    Args:
+        corners: [P, 3, 3], each corner's place in the picture, pixels, and depth, metres.
+        rows, columns: [P] int64.
+
+    Returns:
+        [P, 3], adding up to 1.
+    """
+    pixel = torch.stack([columns, rows], 1).to(corners) + 0.5
+    spokes = corners[..., :2] - pixel[:, None]  # [P, 3, 2]
+    following, last = spokes.roll(-1, dims=1), spokes.roll(-2, dims=1)
+    areas = following[..., 0] * last[..., 1] - following[..., 1] * last[..., 0]
+    weights = areas / corners[..., 2]  # 1 / z is linear on the screen
+    return weights / weights.sum(1, keepdim=True)

@@ -1,0 +1,169 @@
+"""The training objective (paper, Equation 9; supplement D): a few drawn frames to weighted terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.metrics import Lpips
+from pipeline.splat import render
+from stages.train import losses, schedule
+from stages.train.data import Frames, View
+from stages.train.face import face_loss, face_triangles, paste
+from stages.train.perceptual import crop, due, perceptual
+from stages.train.poses import FramePose, PoseRefinement
+from stages.train.regularisers import Regularisers
+from stages.train.settings import TrainSettings
+
+Terms = dict[str, Tensor]
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What an avatar is learnt from.
+
+    Attributes:
+        views: crops of the training frames.
+        frames: the training frames' numbers.
+        times: seconds of frames from the clip's start; a frame without a clock is not in it.
+        texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
+            no term asks for it.
+    """
+
+    views: Frames
+    frames: tuple[int, ...]
+    times: Mapping[int, float]
+    texture: Tensor | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The chance in one draw of a frame. Equal positions in a run draw equally.
+
+    Attributes:
+        position: which draw of the run this is.
+        frame: its number.
+        background: [3], the colour behind the person.
+        noise: [54 * 6], added to what the heads are told of the pose.
+        time: seconds that the residual heads are told; None where they are told none.
+        place: in [0, 1), where on the person LPIPS looks.
+    """
+
+    position: int
+    frame: int
+    background: Tensor
+    noise: Tensor
+    time: float | None
+    place: float
+
+
+class Objective:
+    """The terms of one optimiser step.
+
+    Attributes:
+        avatar, poses: what is trained.
+        evidence: what it is compared with.
+        settings: the weights.
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        poses: PoseRefinement,
+        evidence: Evidence,
+        settings: TrainSettings,
+        network: Lpips | None = None,
+    ):
+        """Reads nothing.
+
+        Args:
+            avatar: what is trained.
+            poses: fitted; they move if they are refined.
+            evidence: the training frames, with a texture if the face loss has a weight.
+            settings: the weights.
+            network: LPIPS; must be given if it has a weight.
+
+        Raises:
+            ValueError: a term has a weight and not what it needs.
+        """
+        if settings.lpips and network is None:
+            raise ValueError("the LPIPS term needs its network")
+        if settings.face and evidence.texture is None:
+            raise ValueError("the face term needs a texture")
+        self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
+        self.network, self.regularisers = network, Regularisers(avatar, settings)
+        self._face = {id(surface): face_triangles(surface.canonical) for surface in avatar.surfaces}
+
+    def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
+        """The weighted terms, averaged over the frames of the step.
+
+        Args:
+            iteration: which step of the run.
+            level: of subdivision.
+            poses_move: whether the refined poses are used, so that gradients reach them.
+        """
+        decoded, batch = self.avatar.decode(level), self.settings.batch
+        draws = [self.draw(iteration * batch + place) for place in range(batch)]
+        total: Terms = {}
+        for draw in draws:
+            for name, value in self._frame_terms(decoded, draw, poses_move).items():
+                total[name] = total.get(name, torch.zeros(())) + value / batch
+        return {**total, **self.regularisers.static(decoded)}
+
+    def draw(self, position: int) -> Draw:
+        """Everything random about the ``position``-th drawn frame of the run."""
+        settings, seed = self.settings, self.settings.seed
+        frame = schedule.drawn_frame(seed, self.evidence.frames, position)
+        timeless = schedule.drawn_share(seed, schedule.TIME, position) < settings.time_dropout
+        length = 6 * (self.poses.poses.rotation.shape[1] - 1)
+        return Draw(
+            position=position,
+            frame=frame,
+            background=schedule.drawn_background(seed, position),
+            noise=settings.pose_noise * schedule.drawn_noise(seed, position, length),
+            time=None if timeless else self.evidence.times.get(frame),
+            place=schedule.drawn_share(seed, schedule.CROP, position),
+        )
+
+    def _frame_terms(self, decoded: Decoded, draw: Draw, poses_move: bool) -> Terms:
+        settings, view = self.settings, self.evidence.views[draw.frame]
+        pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
+        posed = self._pose(decoded, pose, draw)
+        terms = {**self._photometric(posed, view, draw), **self.regularisers.posed(decoded, posed)}
+        if settings.face and not view.generated:
+            terms["face"] = settings.face * self._face_term(decoded, posed, view)
+        if settings.pose_change and poses_move:
+            terms["pose_change"] = settings.pose_change * self.poses.change(draw.frame)
+        return terms
+
+    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw) -> Posed:
+        return self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, draw.noise, draw.time)
+
+    def _photometric(self, posed: Posed, view: View, draw: Draw) -> Terms:
+        """How the rendering differs from the frame, both over the drawn background."""
+        settings = self.settings
+        rendering = render(posed.gaussians, view.camera)
+        image = losses.over(rendering.color, rendering.alpha, draw.background)
+        target = view.composite(draw.background)
+        if settings.mask_band:
+            image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
+        weights = (settings.l1, settings.ssim, settings.lpips)
+        l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
+        terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}
+        if self.network is not None and lpips and due(draw.position, settings.lpips_every):
+            place = crop(view.alpha, settings.lpips_crop, draw.place)
+            # As many times the weight, so that its mean over the run is that of a term of every frame.
+            distance = perceptual(self.network, image, target, place)
+            terms["lpips"] = lpips * settings.lpips_every * distance
+        return terms
+
+    def _face_term(self, decoded: Decoded, posed: Posed, view: View) -> Tensor:
+        if self.evidence.texture is None:
+            raise ValueError("the face term needs a texture")
+        canonical, means = decoded.surface.canonical, posed.gaussians.means
+        chosen, texture = self._face[id(decoded.surface)], self.evidence.texture[: len(means)]
+        return face_loss(paste(view.camera, means, canonical.faces, chosen, texture), view.color, view.alpha)

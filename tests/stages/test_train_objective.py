@@ -1,0 +1,162 @@
+"""The objective on the tiny synthetic subject: which term moves what, and how draws add up."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+from torch import nn
+
+from pipeline.avatar import Avatar
+from stages.train import run as stage
+from stages.train.objective import Evidence, Objective
+from stages.train.poses import PoseRefinement
+from stages.train.settings import TrainSettings
+from tests.stages.train_subject import context_for, write_subject
+
+ALL_ON = {"pose_noise": 0.0, "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0}
+
+
+class Brightness(nn.Module):
+    """Stands for LPIPS: the difference of mean brightness."""
+
+    def forward(self, image, target):
+        return (image.mean() - target.mean()).abs()[None]
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
+    return folder
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """An awakened avatar, every part of it active, and its evidence."""
+
+    settings: TrainSettings
+    avatar: Avatar
+    poses: PoseRefinement
+    evidence: Evidence
+
+    def objective(self, generated=(), **changes) -> Objective:
+        views = copy.copy(self.evidence.views)
+        views.generated = frozenset(generated)
+        evidence = dataclasses.replace(self.evidence, views=views)
+        settings = dataclasses.replace(self.settings, **changes)
+        return Objective(self.avatar, self.poses, evidence, settings, Brightness())
+
+
+def scene(subject, output, **changes) -> Scene:
+    context = context_for(subject, output, **{**ALL_ON, **changes})
+    inputs = stage.read_inputs(context)
+    refinement = PoseRefinement(inputs.poses, inputs.split.train)
+    avatar, _, texture = stage.prepare(inputs, refinement, context.settings, context)
+    avatar.pose_heads_active = avatar.residuals_active = True
+    generator = torch.Generator().manual_seed(5)
+    for parameter in avatar.parameters():
+        parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
+    return Scene(context.settings, avatar, refinement, inputs.evidence(texture))
+
+
+@pytest.fixture(scope="module")
+def objective(subject):
+    """Makes objectives over one avatar; ``changes`` are settings of the objective."""
+    return scene(subject, subject / "gated").objective
+
+
+def gradients(objective: Objective, iterations: range, only: str = "") -> dict[str, torch.Tensor]:
+    """The gradient of each parameter, summed over some iterations at the same weights."""
+    modules = {"avatar": objective.avatar, "poses": objective.poses}
+    for module in modules.values():
+        module.zero_grad(set_to_none=True)
+    for iteration in iterations:
+        terms = objective(iteration, 0, True)
+        chosen = [value for name, value in terms.items() if not only or name == only]
+        torch.stack(chosen).sum().backward()
+    return {
+        f"{prefix}.{name}": torch.zeros_like(parameter) if parameter.grad is None else parameter.grad.clone()
+        for prefix, module in modules.items()
+        for name, parameter in module.named_parameters()
+    }
+
+
+def test_double_batch_equals_two_accumulated_steps(objective):
+    single, double = (
+        objective(batch=1, lpips=0.2, lpips_every=3),
+        objective(batch=2, lpips=0.2, lpips_every=3),
+    )
+    one_by_one, together = gradients(single, range(2, 4)), gradients(double, range(1, 2))
+    for name, gradient in one_by_one.items():
+        torch.testing.assert_close(gradient / 2, together[name], rtol=1e-2, atol=1e-5, msg=name)
+
+
+def test_face_term_moves_geometry_and_poses_and_never_colours(objective):
+    moved = {name for name, one in gradients(objective(), range(1), "face").items() if bool((one != 0).any())}
+    frame = objective().draw(0).frame
+    assert {"avatar.triplane.planes", "avatar.geometry.last.weight", f"poses.rotation.{frame}"} <= moved
+    assert f"poses.transl.{frame}" in moved and f"poses.expression.{frame}" in moved
+    assert not any(
+        name.startswith(("avatar.color", "avatar.pose_color", "avatar.residuals")) for name in moved
+    )
+    assert not any(name.startswith("poses.") and not name.endswith(f".{frame}") for name in moved)
+
+
+def test_pictures_reach_every_head(objective):
+    still = {
+        name
+        for name, one in gradients(objective(pose_change=1.0), range(3)).items()
+        if not bool((one != 0).any()) and name.startswith("avatar.")
+    }
+    assert not still
+
+
+def test_lpips_of_every_kth_draw_has_k_times_the_weight(objective):
+    every, third = objective(lpips=0.2, lpips_every=1), objective(lpips=0.2, lpips_every=3)
+    assert ["lpips" in third(iteration, 0, False) for iteration in range(4)] == [True, False, False, True]
+    for position in (0, 3):
+        one, other = (float(each(position, 0, False)["lpips"].detach()) for each in (every, third))
+        assert one > 0 and other == pytest.approx(3 * one)
+
+
+def test_residual_heads_are_sometimes_told_no_time(objective):
+    made = objective(time_dropout=0.25)
+    times = [made.draw(position).time for position in range(400)]
+    assert 60 < sum(time is None for time in times) < 140
+    assert {time for time in times if time is not None} == {made.evidence.times[f] for f in range(5)}
+    always = objective(time_dropout=0.0)
+    assert all(always.draw(position).time is not None for position in range(50))
+
+
+def test_generated_frames_weigh_less_and_have_no_face(objective):
+    captured, made = objective(), objective(generated=range(6))
+    with torch.no_grad():
+        real, copied = captured(0, 0, False), made(0, 0, False)
+    assert float(copied["l1"]) == pytest.approx(float(real["l1"]) * 0.1 / 0.8)
+    assert float(copied["ssim"]) == pytest.approx(float(real["ssim"]) * 0.1 / 0.2)
+    assert "face" in real and "face" not in copied
+    assert float(copied["laplacian_offset"]) == float(real["laplacian_offset"])
+
+
+def test_mask_in_doubt_lowers_what_the_silhouette_costs(objective):
+    values = [float(objective(mask_band=band)(0, 0, False)["l1"].detach()) for band in (0, 1, 3)]
+    assert values[0] > values[1] > values[2] > 0
+
+
+def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject):
+    whole = scene(subject, subject / "whole", gate=False).objective
+    optional = {"hand_normal", "scale_size", "scale_growth", "hand_color", "arm_color"}
+    none = whole(scale_growth=0.0)(0, 0, False)
+    every = whole(**dict.fromkeys(optional, 1.0))(0, 0, False)
+    assert not optional & set(none) and optional <= set(every)
+    assert all(float(every[name].detach()) > 0 for name in optional)
+
+
+def test_term_that_lacks_what_it_needs_is_refused(objective):
+    made = objective()
+    bare = dataclasses.replace(made.evidence, texture=None)
+    with pytest.raises(ValueError, match="texture"):
+        Objective(made.avatar, made.poses, bare, made.settings)
+    with pytest.raises(ValueError, match="LPIPS"):
+        Objective(made.avatar, made.poses, made.evidence, dataclasses.replace(made.settings, lpips=0.2))

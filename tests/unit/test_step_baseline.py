@@ -1,0 +1,129 @@
+"""The training step's benchmark: both of its contestants compute the same, and its clock adds up."""
+
+import json
+import time
+
+import numba
+import pytest
+import torch
+
+from benchmarks import animate, step
+from benchmarks.avatars import avatar_of
+from benchmarks.parts import PartClock
+from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
+from pipeline.avatar import Architecture
+from pipeline.threads import threads
+
+SMALL = Architecture(plane_resolution=16, plane_channels=4, width=16, groups=4)
+COUNT = 7000  # head, arms and some of the torso of the unsubdivided body
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Small cases: threads would mostly wait for each other."""
+    numba.get_num_threads()  # its pool, when it starts, sets torch's number of threads
+    with threads(1):
+        yield
+
+
+@pytest.fixture
+def pair():
+    avatar = avatar_of(COUNT, SMALL, half_precision=False)
+    return avatar, StraightforwardAvatar(avatar)
+
+
+@pytest.mark.parametrize("count", [COUNT, 14_000])
+def test_an_avatar_is_about_as_large_as_asked_for(count):
+    assert abs(len(avatar_of(count, SMALL)) / count - 1) < 0.02
+
+
+def test_a_body_without_enough_vertices_is_refused():
+    with pytest.raises(ValueError, match="no 10000000 vertices"):
+        avatar_of(10_000_000, SMALL)
+
+
+def test_straightforward_gaussians_are_ours(pair):
+    avatar, plain = pair
+    pose = step.frames_of(avatar, 1, 16)[0].pose
+    ours, theirs = (model.pose(model.decode(), *pose.values()) for model in pair)
+    for mine, other in zip(ours.gaussians.tensors(), theirs.gaussians.tensors(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-5)
+    assert ours.pose_offset.abs().max() > 0
+    torch.testing.assert_close(ours.pose_offset, theirs.pose_offset, rtol=1e-4, atol=1e-7)
+
+
+def test_straightforward_gradients_are_ours_also_over_several_frames(pair):
+    contestants = [
+        step.Contestant(str(shared), model, step._adam(model, fused=shared), shared)
+        for shared, model in zip((True, False), pair, strict=True)
+    ]
+    frames = step.frames_of(pair[0], 2, 48)
+    image, gradient = step.difference(*contestants, frames)
+    assert image < 1e-5 and gradient < 1e-2
+    for one in contestants:
+        one.objective(frames).backward()
+    for name, (mine, theirs) in matched_gradients(*pair).items():
+        assert mine.abs().max() > 0, name
+        assert (mine - theirs).norm() < 1e-2 * theirs.norm(), name
+
+
+def test_decoding_only_what_is_seen_changes_neither_picture_nor_what_it_teaches(pair):
+    avatar, plain = pair
+    ours = step.Contestant("seen", avatar, step._adam(avatar, fused=True), shared=True, seen=True)
+    theirs = step.Contestant("plain", plain, step._adam(plain, fused=False), shared=False)
+    frames = step.frames_of(avatar, 2, 48)
+    assert not frames[0].seen.all() and frames[0].inner.sum() < frames[0].seen.sum()
+    image, gradient = step.difference(ours, theirs, frames)
+    assert image < 1e-5 and gradient < 1e-2
+
+
+def test_it_prints_tables_and_a_headline_and_writes_every_time(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(step, "avatar_of", lambda count, **kwargs: avatar_of(count, SMALL, **kwargs))
+    path = tmp_path / "step.json"
+    words = ["--gaussians", str(COUNT), "--sizes", "32", "--repeats", "2", "--json", str(path)]
+    step.main(words)
+    lines = capsys.readouterr().out.splitlines()
+    for part in step.PARTS:
+        assert sum(line.startswith(part) for line in lines) == 1, part
+    assert "straightforward takes" in lines[-1] and "Gaussians at 32²" in lines[-1]
+    timings = json.loads(path.read_text())["timings"]
+    assert [len(timing["steps"]) for timing in timings] == [2, 2, 2, 2]
+    assert all(set(one) == set(step.PARTS) for timing in timings for one in timing["steps"])
+
+
+def test_animation_has_a_row_a_contestant_and_a_headline(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(animate, "avatar_of", lambda count: avatar_of(count, SMALL))
+    path = tmp_path / "animate.json"
+    words = ["--gaussians", str(COUNT), "--sizes", "32", "--repeats", "2", "--json", str(path)]
+    animate.main(words)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 3 + 1 and "frames a second" in lines[-1]
+    timings = json.loads(path.read_text())["timings"]
+    count = timings[0]["gaussians"]
+    assert all(timing["asset_mib"] == 14 * 4 * count / 2**20 for timing in timings)  # as the paper counts it
+    assert [timing["file_mib"] > 0 for timing in timings] == [False, False, True]
+
+
+class Slow(torch.autograd.Function):
+    """Waits forwards, and twice as long backwards."""
+
+    @staticmethod
+    def forward(ctx, x):
+        time.sleep(0.02)
+        return 2 * x
+
+    @staticmethod
+    def backward(ctx, gradient):
+        time.sleep(0.04)
+        return 2 * gradient
+
+
+def test_the_clock_counts_a_part_in_both_directions_and_changes_nothing():
+    clock, x = PartClock("rest"), torch.ones(3, requires_grad=True)
+    slow = clock.timed("slow", Slow.apply)
+    clock.start()
+    (slow(3 * x) * 5).sum().backward()
+    clock.stop()
+    assert torch.equal(x.grad, torch.full((3,), 30.0))
+    assert set(clock.spent) == {"slow", "rest"}
+    assert clock.spent["slow"][0] >= 0.06  # sleeping lasts at least as long as asked for
