@@ -30,6 +30,7 @@ RATES = {
 """Adam's step for each group of parameters: radians, metres or units of the coefficients."""
 
 ROOT_UNTIL, OFFSETS_FROM, ROBUST_FROM = 0.15, 0.4, 0.3
+WARM_UP = 10  # iterations over which the steps grow to their full length
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 """From which share of the iterations on steps have which width in time: standard deviation in frames."""
 
@@ -133,20 +134,26 @@ def optimise(
         FloatingPointError: the loss is not finite.
     """
     base = initial.detached()
+    # Adam keeps its memory from phase to phase: begun anew, its first steps have the full length in every
+    # direction at once, and threw the body off its points by 180 pixels.
+    steps = base.zeros()
+    adam = torch.optim.Adam(
+        [{"params": [leaf], "name": name} for name, leaf in steps.named().items()], betas=(0.9, 0.99)
+    )
     with threads(1):
         for begin, end, width in _phases(iterations):
-            steps = base.zeros()
-            groups = [{"params": [leaf], "name": name} for name, leaf in steps.named().items()]
-            adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
             for step in range(begin, end):
-                done = step / iterations
                 for group in adam.param_groups:
-                    group["lr"] = learning_rate * rate(group["name"], done, frozen)
-                loss = gradients(objective, base, steps, width, minibatch, done > ROBUST_FROM, step)
+                    share = rate(group["name"], step / iterations, frozen)
+                    group["lr"] = learning_rate * share * min(1.0, (step + 1) / WARM_UP)
+                robust = step / iterations > ROBUST_FROM
+                loss = gradients(objective, base, steps, width, minibatch, robust, step)
                 adam.step()
                 now = functools.partial(_moved, base, steps, objective.times, width, minibatch)
                 watch(step + 1, loss, now)
             base = _moved(base, steps, objective.times, width, minibatch)
+            for leaf in steps.named().values():
+                leaf.zero_()
     return base
 
 

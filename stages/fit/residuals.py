@@ -13,7 +13,7 @@ from pipeline.tables import write_table
 from stages.fit.observations import GROUPS, Observations
 
 SCHEMA = pa.schema(
-    [("frame", pa.int32()), ("group", pa.string()), ("pixels", pa.float32()), ("points", pa.int32())]
+    [("frame", pa.int32()), ("group", pa.string()), ("point", pa.int32()), ("pixels", pa.float32())]
 )
 
 
@@ -29,23 +29,25 @@ def group_means(error: Tensor, observations: Observations) -> dict[str, float]:
 
 
 def write_residuals(path: Path, error: Tensor, observations: Observations) -> None:
-    """Write ``residuals.parquet``: frame, group, mean pixels, number of points; unseen groups have no row.
+    """Write ``residuals.parquet``, a row a keypoint that was trusted in a frame.
+
+    Columns: ``frame``; ``group`` and ``point``, the keypoint as the number that its source gives it within
+    the group; ``pixels``, its reprojection error. Masked keypoints have no row.
 
     Args:
         path: the file.
         error: [T, N], pixels, NaN where masked.
         observations: whose points they are.
     """
-    frames, groups, pixels, points = [], [], [], []
-    for row, frame in enumerate(observations.frames.tolist()):
-        for name in GROUPS:
-            seen = error[row, observations.of(name)]
-            seen = seen[~seen.isnan()]
-            if len(seen):
-                frames.append(frame)
-                groups.append(name)
-                pixels.append(float(seen.mean()))
-                points.append(len(seen))
-    columns = {"frame": np.array(frames, np.int32), "group": np.array(groups, dtype=object)}
-    columns |= {"pixels": np.array(pixels, np.float32), "points": np.array(points, np.int32)}
+    group = observations.group.numpy()
+    within = np.zeros(len(group), np.int32)
+    for number in range(len(GROUPS)):
+        within[group == number] = np.arange((group == number).sum())
+    rows, points = np.nonzero(~np.isnan(error.numpy()))
+    columns = {
+        "frame": observations.frames.numpy()[rows].astype(np.int32),
+        "group": np.array(GROUPS, dtype=object)[group[points]],
+        "point": within[points],
+        "pixels": error.numpy()[rows, points],
+    }
     write_table(path, SCHEMA, columns)

@@ -12,7 +12,7 @@ SOLVERS = ("adam", "lm")
 class FitSettings:
     """Settings of the fit stage; lengths in metres, angles in radians."""
 
-    iterations: int = 400  # steps of the solver over the whole clip; 0 publishes the initialisation
+    iterations: int = 200  # steps of the solver over the whole clip; 0 publishes the initialisation
     solver: str = "adam"  # how the objective is minimised: adam or lm
     minibatch: int = 256  # frames posed at a time: memory does not grow with the clip
     learning_rate: float = 1.0  # factor on Adam's step of every group of parameters
@@ -20,7 +20,7 @@ class FitSettings:
     # Objective
     masked: bool = True  # m of Eq. 2; false trusts every detection, also outside the picture
     score_threshold: float = 0.4  # tau: keypoints that score less are masked (Eq. 2)
-    betas: int = 16  # shape coefficients, as far as the body has them
+    betas: int = 100  # shape coefficients, as many of these as the body has
     joint_offsets: bool = True  # fit Delta J
     face_offsets: bool = True  # fit Delta V_face, where the face is seen
     lambda_init: float = 0.1  # weight of staying near the initial pose (Eq. 1)
