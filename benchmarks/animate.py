@@ -21,7 +21,7 @@ import torch
 
 from benchmarks.avatars import Pose, avatar_camera, avatar_of, poses_of
 from benchmarks.machine import described, prepare
-from pipeline.avatar import Avatar
+from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import BakedAvatar, bake, save_baked
 from pipeline.splat import Gaussians, render
 
@@ -29,6 +29,7 @@ COUNTS, SIZES = (10_000, 40_000, 167_000), (256, 512)
 QUICK_COUNTS, QUICK_SIZES = (10_000,), (256,)
 HEADLINE = (40_000, 512)
 POSES = 4  # taken in turn
+PAPERS = Architecture(residual_parts=("face", "left_hand", "right_hand"))
 CLOCKS = ("wall", "cpu")
 EACH_FRAME, UNBAKED, BAKED = "decoded each frame", "unbaked", "baked"
 WIDTHS = (10, 7, 20, 10, 10, 10, 10, 10, 10, 8)
@@ -72,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(_row("#G", "image", "", "asset MB", "file MB", "anim", "median", "rend", "total", "FPS"))
     timings: list[Timing] = []
     for count in counts:
-        avatar = avatar_of(count).eval()
+        avatar = avatar_of(count, PAPERS).eval()
         baked = bake(avatar)
         for size in sizes:
             taken = _race(avatar, baked, size, options.repeats or (3 if options.quick else 15))

@@ -42,7 +42,7 @@ def avatar_of(count: int, architecture: Architecture | None = None, half_precisi
 
     Args:
         count: of Gaussians; it is met to a hundredth.
-        architecture: sizes; the paper's if None. ``subdivisions`` is overridden.
+        architecture: sizes; the paper's without residual heads if None. ``subdivisions`` is overridden.
         half_precision: whether the heads run in bfloat16.
 
     Raises:

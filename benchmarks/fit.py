@@ -66,7 +66,7 @@ MOTIONS = {
 }
 IDENTITIES = (1, 2)
 FRAMES, QUICK_FRAMES = 30, 8
-EFFORTS, QUICK_EFFORTS = (25, 50, 100, 200, 400, 800), (10, 20)
+EFFORTS, QUICK_EFFORTS = (25, 50, 100, 200, 400), (10, 20)
 QUICK_ITERATIONS = 20  # of the error table: enough to see that it runs
 COLUMNS = ("joints", "Procrustes", "body", "surface", "pixels")
 _REPEATS = 7  # of the posing cost; the least time counts

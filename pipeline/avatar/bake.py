@@ -22,7 +22,7 @@ from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decod
 from pipeline.avatar.fused import Layers, arranged, arranged_rows, finish
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
-from pipeline.avatar.residual import encode
+from pipeline.avatar.residual import encode, time_code
 from pipeline.body import joint_transforms
 from pipeline.errors import UserError
 from pipeline.splat import Gaussians
@@ -170,19 +170,11 @@ class BakedAvatar:
     def _with_residuals(self, logits: Tensor, means: Tensor, theta: Tensor, time: float | None) -> Tensor:
         if not self.residuals:
             return logits
-        condition = torch.cat([self._time_code(time), theta])
+        condition = torch.cat([time_code(time, self.time_range, self.time_frequencies), theta])
         for part in self.residuals.values():
             own = encode(means[part.rows], self.place_frequencies) if self.posed_place else None
             logits = logits.index_add(0, part.rows, part.head(condition, own))
         return logits
-
-    def _time_code(self, time: float | None) -> Tensor:
-        """As ``Residuals.time_code``."""
-        if time is None:
-            return torch.zeros(1 + 2 * self.time_frequencies)
-        first, last = self.time_range.unbind()
-        done = ((time - first) / (last - first).clamp_min(1e-6)).clamp(0, 1)
-        return encode(done[None], self.time_frequencies)
 
 
 @torch.no_grad()
@@ -207,7 +199,7 @@ def bake(avatar: Avatar) -> BakedAvatar:
             )
     return BakedAvatar(
         constants=_constants(avatar, decoded),
-        rig=Rig.build(surface.canonical),
+        rig=surface.rig,
         parents=surface.canonical.parents,
         opacity=avatar.architecture.opacity,
         geometry=heads[0],

@@ -23,8 +23,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pipeline.avatar.fused_kernels import lanes_of, norm_relu, norm_relu_backward, sum_norm_relu
-from pipeline.avatar.norm import CHUNKS, _bits
+from pipeline.avatar.fused_kernels import (
+    CHUNKS,
+    bits,
+    lanes_of,
+    norm_relu,
+    norm_relu_backward,
+    sum_norm_relu,
+)
 
 ROWS = 4096  # at a time
 
@@ -124,13 +130,13 @@ def finish(
     use_torch_threads()
     output = products.new_empty(len(products), len(layers.biases[-1]))
     spare = [products.new_empty(min(ROWS, len(products)), products.shape[1]) for _ in range(2)]
-    norm = _bits(layers.norm_weights[0]), _bits(layers.norm_biases[0])
+    norm = bits(layers.norm_weights[0]), bits(layers.norm_biases[0])
     lanes, groups = lanes_of(products.shape[1], layers.groups), np.uint64(layers.groups)
     for start in range(0, len(products), ROWS):
         chunk = slice(start, min(start + ROWS, len(products)))
         y, z = (one[: chunk.stop - start] for one in spare)
-        extra, weight = _bits(own[0][chunk]), _bits(own[1])
-        sum_norm_relu(_bits(products[chunk]), _bits(shared), extra, weight, *norm, lanes, groups, _bits(y))
+        extra, weight = bits(own[0][chunk]), bits(own[1])
+        sum_norm_relu(bits(products[chunk]), bits(shared), extra, weight, *norm, lanes, groups, bits(y))
         for place in range(1, len(layers.norm_weights)):
             torch.addmm(layers.biases[place], y, layers.weights[place].t(), out=z)
             _norm_relu(z, place, layers, y)
@@ -139,9 +145,9 @@ def finish(
 
 
 def _norm_relu(z: Tensor, place: int, layers: Layers, y: Tensor) -> None:
-    norm = _bits(layers.norm_weights[place]), _bits(layers.norm_biases[place])
+    norm = bits(layers.norm_weights[place]), bits(layers.norm_biases[place])
     lanes = lanes_of(z.shape[1], layers.groups)
-    norm_relu(_bits(z), *norm, lanes, np.uint64(layers.groups), _bits(y))
+    norm_relu(bits(z), *norm, lanes, np.uint64(layers.groups), bits(y))
 
 
 def use_torch_threads() -> None:
@@ -209,15 +215,15 @@ def _backward(
         push = gradient[chunk]
         for place in reversed(range(count)):
             down = torch.mm(push, layers.weights[place + 1], out=downs[place % 2])
-            norm = _bits(layers.norm_weights[place]), _bits(layers.norm_biases[place])
+            norm = bits(layers.norm_weights[place]), bits(layers.norm_biases[place])
             norm_relu_backward(
-                _bits(hidden[place][chunk]),
-                _bits(down),
+                bits(hidden[place][chunk]),
+                bits(down),
                 *norm,
                 lanes,
                 groups,
-                _bits(down),
-                _bits(y),
+                bits(down),
+                bits(y),
                 sums[place],
             )
             to_weights[place + 1] += push.t() @ y

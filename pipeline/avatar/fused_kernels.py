@@ -1,13 +1,20 @@
-"""The kernels of ``fused.py``: the norm between a head's layers, for centred rows with interleaved groups."""
+"""The kernels of ``fused.py``: the norm between a head's layers, for centred rows with interleaved groups.
+
+Numba does not know bfloat16: it is read as the upper half of a float32, from memory seen as uint16.
+"""
 
 from __future__ import annotations
 
 import numba
 import numpy as np
+import torch
+from numba.extending import overload
+from torch import Tensor
 
-from pipeline.avatar.norm import CHUNKS, EPSILON, FAST, _load, _round
-
+EPSILON = 1e-5
 MOST_LANES = 32
+CHUNKS = 16  # of rows; sums over rows are added up chunk by chunk, whatever the number of threads
+FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # never "nnan" or "ninf": what is not finite must show
 
 
 def lanes_of(channels: int, groups: int) -> np.uint64:
@@ -16,6 +23,41 @@ def lanes_of(channels: int, groups: int) -> np.uint64:
     while lanes * 2 <= MOST_LANES and channels % (lanes * 2) == 0:
         lanes *= 2
     return np.uint64(lanes)
+
+
+def bits(x: Tensor) -> np.ndarray:
+    """The tensor's memory as numpy can hold it: bfloat16 as uint16."""
+    x = x.detach()
+    return x.view(torch.uint16).numpy() if x.dtype == torch.bfloat16 else x.numpy()
+
+
+def load(x):
+    """A stored number as float32."""
+
+
+def rounded(value, like):
+    """A float32 as a number of the same kind as ``like`` is stored."""
+
+
+@overload(load, inline="always")
+def _load(x):
+    if x is numba.types.uint16:
+        return lambda x: np.uint32(np.uint32(x) << np.uint32(16)).view(np.float32)
+    return lambda x: x
+
+
+@overload(rounded, inline="always")
+def _rounded(value, like):
+    if like is not numba.types.uint16:
+        return lambda value, like: value
+
+    def to_nearest_even(value, like):
+        word = np.float32(value).view(np.uint32)
+        return np.uint16(
+            (word + np.uint32(0x7FFF) + ((word >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16)
+        )
+
+    return to_nearest_even
 
 
 # Lane counts are run-time numbers and unsigned, or the loops would be unrolled before they are vectorised.
@@ -77,11 +119,11 @@ def norm_relu(x, weight, bias, lanes, groups, y):
         normal, inverse = np.empty(channels, np.float32), np.empty(lanes, np.float32)
         for row in range(chunk * step, min(rows, (chunk + 1) * step)):
             for k in range(channels):
-                normal[k] = _load(x[row, k])
+                normal[k] = load(x[row, k])
             _standardise(normal, inverse, lanes, groups, channels)
             for k in range(channels):
                 value = normal[k] * weight[k] + bias[k]
-                y[row, k] = _round(np.float32(0) if value < 0 else value, x[row, k])
+                y[row, k] = rounded(np.float32(0) if value < 0 else value, x[row, k])
 
 
 @numba.njit(parallel=True, fastmath=FAST, cache=True)
@@ -93,14 +135,14 @@ def sum_norm_relu(products, shared, own, own_weight, weight, bias, lanes, groups
         normal, inverse = np.empty(channels, np.float32), np.empty(lanes, np.float32)
         for row in range(chunk * step, min(rows, (chunk + 1) * step)):
             for k in range(channels):
-                normal[k] = _load(products[row, k]) + shared[k]
+                normal[k] = load(products[row, k]) + shared[k]
             for e in range(own.shape[1]):
                 for k in range(channels):
                     normal[k] += own[row, e] * own_weight[e, k]
             _standardise(normal, inverse, lanes, groups, channels)
             for k in range(channels):
                 value = normal[k] * weight[k] + bias[k]
-                y[row, k] = _round(np.float32(0) if value < 0 else value, products[row, k])
+                y[row, k] = rounded(np.float32(0) if value < 0 else value, products[row, k])
 
 
 @numba.njit(fastmath=FAST, inline="always")
@@ -149,15 +191,15 @@ def norm_relu_backward(x, gradient, weight, bias, lanes, groups, to_x, y, sums):
         own = np.zeros((3, channels), np.float32)
         for row in range(chunk * step, min(rows, (chunk + 1) * step)):
             for k in range(channels):
-                normal[k] = _load(x[row, k])
+                normal[k] = load(x[row, k])
             _standardise(normal, inverse, lanes, groups, channels)
             for k in range(channels):
                 value = normal[k] * weight[k] + bias[k]
-                push[k] = _load(gradient[row, k]) if value > 0 else np.float32(0)
-                y[row, k] = _round(np.float32(0) if value < 0 else value, x[row, k])
+                push[k] = load(gradient[row, k]) if value > 0 else np.float32(0)
+                y[row, k] = rounded(np.float32(0) if value < 0 else value, x[row, k])
             _affine_backward(push, normal, weight, own)
             _standardise_backward(push, normal, inverse, along, lanes, groups, channels)
             for k in range(channels):
                 own[2, k] += push[k]
-                to_x[row, k] = _round(push[k], x[row, k])
+                to_x[row, k] = rounded(push[k], x[row, k])
         sums[chunk] += own

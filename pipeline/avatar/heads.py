@@ -5,14 +5,18 @@ from __future__ import annotations
 import dataclasses
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from pipeline.avatar.fused import Layers, decode
-from pipeline.avatar.norm import group_norm_relu
+from pipeline.avatar.fused_kernels import EPSILON
 
 
 class GroupNormReLU(nn.Module):
-    """``relu(torch.nn.GroupNorm(x))`` for [N, C] inputs, in one pass (see ``norm.py``)."""
+    """``relu(torch.nn.GroupNorm(x))`` for [N, C] inputs, by ``layer_norm`` on a view.
+
+    On a CPU ``fused.py`` computes it together with the layers around it.
+    """
 
     def __init__(self, groups: int, channels: int):
         super().__init__()
@@ -22,7 +26,9 @@ class GroupNormReLU(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalises each group of channels of each row, then clips: [N, C] -> [N, C]."""
-        return group_norm_relu(x, self.weight, self.bias, self.groups)
+        grouped = x.view(len(x), self.groups, -1)
+        normal = functional.layer_norm(grouped, grouped.shape[2:], eps=EPSILON).view(x.shape)
+        return functional.relu(torch.addcmul(self.bias.to(x.dtype), normal, self.weight.to(x.dtype)))
 
 
 class Head(nn.Module):

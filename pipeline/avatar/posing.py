@@ -15,9 +15,7 @@ from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
 from pipeline.avatar.fused import use_torch_threads
-
-CHUNKS = 16  # of Gaussians, for the threads
-FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # never "nnan" or "ninf": what is not finite must show
+from pipeline.avatar.fused_kernels import CHUNKS, FAST
 
 
 def joints_of_points(skinning_weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -102,6 +102,24 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
     return torch.cat([values, waves], -1)
 
 
+def time_code(time: float | None, time_range: Tensor, frequencies: int) -> Tensor:
+    """gamma(t) of a time in seconds: [1 + 2 L]; zero without a time.
+
+    The interval of the training frames is mapped to [0, 1], where the lowest sine and cosine tell
+    every moment from every other; times outside of it are clamped.
+
+    Args:
+        time: seconds from the clip's start; None where there is no clock.
+        time_range: [2], seconds of the first and the last training frame.
+        frequencies: L.
+    """
+    if time is None:
+        return torch.zeros(1 + 2 * frequencies)
+    first, last = time_range.unbind()
+    done = ((time - first) / (last - first).clamp_min(1e-6)).clamp(0, 1)
+    return encode(done[None], frequencies)
+
+
 class Residuals(nn.Module):
     """The residual colour heads, one a part.
 
@@ -145,16 +163,8 @@ class Residuals(nn.Module):
         self.register_buffer("time_range", torch.tensor([0.0, 1.0]))
 
     def time_code(self, time: float | None) -> Tensor:
-        """gamma(t) of a time in seconds: [1 + 2 L]; zero without a time.
-
-        The interval of the training frames is mapped to [0, 1], where the lowest sine and cosine tell
-        every moment from every other; times outside of it are clamped.
-        """
-        if time is None:
-            return torch.zeros(1 + 2 * self.time_frequencies)
-        first, last = self.time_range.unbind()
-        done = ((time - first) / (last - first).clamp_min(1e-6)).clamp(0, 1)
-        return encode(done[None], self.time_frequencies)
+        """gamma(t), see ``time_code`` of the module."""
+        return time_code(time, self.time_range, self.time_frequencies)
 
     def forward(self, places: tuple[Region, ...], means: Tensor, theta: Tensor, time: float | None) -> Tensor:
         """Delta C_res of every Gaussian, zero where there is no head: [N, 3] logits.

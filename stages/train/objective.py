@@ -39,6 +39,15 @@ class Evidence:
     times: Mapping[int, float]
     texture: Tensor | None = None
 
+    @property
+    def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The captured and the generated frames: equally often drawn, however many of each there are."""
+        made = self.views.generated
+        return (
+            tuple(frame for frame in self.frames if frame not in made),
+            tuple(frame for frame in self.frames if frame in made),
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
@@ -117,7 +126,7 @@ class Objective:
     def draw(self, position: int) -> Draw:
         """Everything random about the ``position``-th drawn frame of the run."""
         settings, seed = self.settings, self.settings.seed
-        frame = schedule.drawn_frame(seed, self.evidence.frames, position)
+        frame = schedule.drawn_of_two(seed, self.evidence.sources, position)
         timeless = schedule.drawn_share(seed, schedule.TIME, position) < settings.time_dropout
         length = 6 * (self.poses.poses.rotation.shape[1] - 1)
         return Draw(

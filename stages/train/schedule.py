@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.train.settings import TrainSettings
 
-FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP = 1, 2, 3, 4, 5  # purposes
+FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP, SOURCE = 1, 2, 3, 4, 5, 6  # purposes
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
@@ -42,7 +42,20 @@ def drawn_frame(seed: int, frames: tuple[int, ...], position: int) -> int:
     return frames[_order(seed, len(frames), epoch)[place]]
 
 
-@functools.lru_cache(maxsize=2)
+def drawn_of_two(seed: int, sources: tuple[tuple[int, ...], tuple[int, ...]], position: int) -> int:
+    """The frame of the ``position``-th draw from two sources that are drawn equally often.
+
+    Every two draws hold one of each, in random order; within a source as ``drawn_frame``. An empty
+    source leaves all draws to the other.
+    """
+    if not all(sources):
+        return drawn_frame(seed, sources[0] or sources[1], position)
+    pair, second = divmod(position, 2)
+    swapped = drawn_share(seed, SOURCE, pair) < 0.5
+    return drawn_frame(seed, sources[second ^ swapped], pair)
+
+
+@functools.lru_cache(maxsize=4)
 def _order(seed: int, count: int, epoch: int) -> np.ndarray:
     return np.random.default_rng([seed, FRAMES, epoch]).permutation(count)
 

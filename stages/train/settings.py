@@ -16,13 +16,15 @@ PARTS = (
 )  # fmt: skip
 COUNTS = (
     "iterations", "batch", "held_out_every", "checkpoint_every", "gate_frames", "groups", "lpips_every",
+    "plane_channels", "width", "residual_width",
 )  # fmt: skip
 FRACTIONS = (
     "subdivide_from", "pose_heads_from", "refine_from", "residual_from", "residual_seen", "time_dropout",
     "final_rate",
 )  # fmt: skip
 AMOUNTS = (
-    "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "seed", "pose_noise",
+    "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "plane_learning_rate",
+    "pose_learning_rate", "offset_unit", "pose_offset_unit", "seed", "pose_noise",
     "threads", "place_frequencies", "time_frequencies", "lpips_crop", "mask_band", "l1", "ssim", "lpips",
     "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
     "laplacian_scale_face", "laplacian_color", "laplacian_color_hands", "offset", "offset_hands",
@@ -126,6 +128,7 @@ class TrainSettings:
         self._require(("subdivisions",), lambda value: value in (0, 1, 2), "be 0, 1 or 2")
         if self.subdivisions:
             self._require(("subdivide_from",), lambda value: value < 1, "be less than 1")
+        self._require(("scale", "thickness"), lambda value: value > 0, "be more than 0")
         self._require(("plane_resolution",), lambda value: value >= 2, "be at least 2")
         self._require(("groups",), lambda value: self.width % value == 0, f"divide train.width, {self.width}")
         self._require(("opacity",), lambda value: 0 < value < 1, "lie between 0 and 1")

@@ -27,6 +27,7 @@ SCHEMA = pa.schema(
     [("vertex", pa.int32()), ("frames", pa.int32()), ("weight", pa.float32()), ("kept", pa.bool_())]
 )
 DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
+BELIEVED = 0.5  # trust from which a pixel has a say in first colours
 SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
 
 
@@ -104,8 +105,9 @@ def first_colors(
             gaussians = _gaussians(avatar, poses, frame)
         colors = gaussians.colors.clone().requires_grad_()
         color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
-        believed = trust(view.alpha, band) if band else torch.ones_like(view.alpha)
-        person = (believed * (view.alpha > 0.5))[..., None]
+        # All or nothing: a mean does not feel a small weight that all of its members share.
+        believed = trust(view.alpha, band) >= BELIEVED
+        person = (believed & (view.alpha > 0.5)).float()[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
     neighbours = avatar.surfaces[-1].neighbours

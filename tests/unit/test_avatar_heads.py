@@ -1,11 +1,12 @@
 """The decoders: their norm, their condition on the pose, and how they start."""
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from pipeline.avatar.fused_kernels import CHUNKS, bits, lanes_of, norm_relu, norm_relu_backward
 from pipeline.avatar.heads import GroupNormReLU, Head
-from pipeline.avatar.norm import group_norm_relu, reference
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -18,13 +19,12 @@ def randomised(module: nn.Module) -> nn.Module:
     return module
 
 
-@pytest.mark.parametrize("way", [group_norm_relu, reference])
 @pytest.mark.parametrize("groups", [1, 4, 8])
-def test_norm_equals_torchs_group_norm_with_gradients(groups, way):
+def test_norm_equals_torchs_group_norm_with_gradients(groups):
     ours, theirs = randomised(GroupNormReLU(groups, 32)), nn.GroupNorm(groups, 32)
     theirs.load_state_dict(ours.state_dict())
     inputs = [(3 * drawn(50, 32) + 1).requires_grad_() for _ in range(2)]
-    outputs = [way(inputs[0], ours.weight, ours.bias, groups), theirs(inputs[1]).relu()]
+    outputs = [ours(inputs[0]), theirs(inputs[1]).relu()]
     torch.testing.assert_close(*outputs)
     for output in outputs:
         (output * drawn(50, 32, seed=1)).sum().backward()
@@ -33,28 +33,31 @@ def test_norm_equals_torchs_group_norm_with_gradients(groups, way):
     torch.testing.assert_close(ours.bias.grad, theirs.bias.grad, rtol=1e-4, atol=1e-5)
 
 
-def test_norm_in_bfloat16_is_the_rounded_result_with_gradients():
-    x = (3 * drawn(40, 32) + 1).bfloat16()
-    weight, bias, push = drawn(32, seed=1), drawn(32, seed=2), drawn(40, 32, seed=3).bfloat16()
+def test_kernels_in_bfloat16_give_the_rounded_result_with_gradients():
+    x, push = (drawn(40, 32, seed=seed).bfloat16() for seed in (0, 3))
+    norm, lanes = [bits(drawn(32, seed=seed)) for seed in (1, 2)], lanes_of(32, 4)
     results = []
     for kind in (torch.float32, torch.bfloat16):
-        inputs = [tensor.clone().requires_grad_() for tensor in (x.to(kind), weight, bias)]
-        output = group_norm_relu(*inputs, 4)
-        output.backward(push.to(kind))
-        assert output.dtype == kind
-        results.append([output, *(tensor.grad for tensor in inputs)])
+        y, again, to_x = (torch.empty(40, 32, dtype=kind) for _ in range(3))
+        sums = np.zeros((CHUNKS, 3, 32), np.float32)
+        norm_relu(bits(x.to(kind)), *norm, lanes, np.uint64(4), bits(y))
+        given = bits(x.to(kind)), bits(push.to(kind))
+        norm_relu_backward(*given, *norm, lanes, np.uint64(4), bits(to_x), bits(again), sums)
+        assert torch.equal(y, again)
+        results.append((y, to_x, sums))
     single, half = results
     assert torch.equal(half[0], single[0].bfloat16())  # rounded to nearest, as torch rounds
     assert torch.equal(half[1], single[1].bfloat16())
-    torch.testing.assert_close(half[2:], single[2:])
+    np.testing.assert_allclose(half[2], single[2], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16])
-def test_norm_lets_nothing_that_is_not_finite_vanish(kind):
-    x = drawn(3, 8).to(kind)
+@pytest.mark.parametrize("half", [False, True])
+def test_head_lets_nothing_that_is_not_finite_vanish(half):
+    head, x = randomised(Head(8, 2, width=16, groups=4)), drawn(3, 8)
     x[1, 2] = float("nan")
-    output = group_norm_relu(x, torch.ones(8), torch.zeros(8), 2)
-    assert output[1, :4].isnan().all() and output[1, 4:].isfinite().all() and output[::2].isfinite().all()
+    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+        output = head(x)
+    assert output[1].isnan().all() and output[::2].isfinite().all()
 
 
 def test_split_first_layer_equals_concatenated_inputs():

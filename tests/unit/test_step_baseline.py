@@ -92,7 +92,7 @@ def test_it_prints_tables_and_a_headline_and_writes_every_time(monkeypatch, caps
 
 
 def test_animation_has_a_row_a_contestant_and_a_headline(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(animate, "avatar_of", lambda count: avatar_of(count, SMALL))
+    monkeypatch.setattr(animate, "avatar_of", lambda count, _: avatar_of(count, SMALL))
     path = tmp_path / "animate.json"
     words = ["--gaussians", str(COUNT), "--sizes", "32", "--repeats", "2", "--json", str(path)]
     animate.main(words)

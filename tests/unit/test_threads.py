@@ -8,9 +8,9 @@ from pipeline.workspace import REPOSITORY
 PROGRAM = """
 import torch
 from pipeline.threads import threads
-from pipeline.avatar.norm import group_norm_relu
+from pipeline.avatar.heads import Head
 with threads(1):
-    group_norm_relu(torch.ones(4, 4), torch.ones(4), torch.zeros(4), 2)  # numba's first parallel kernel
+    Head(4, 2, width=8, groups=2)(torch.ones(4, 4))  # numba's first parallel kernel
     print(torch.get_num_threads())
 """
 

@@ -165,7 +165,18 @@ def test_lpips_is_asked_for_only_where_it_has_a_weight():
 
 
 @pytest.mark.parametrize(
-    "change", [{"lpips_network": "resnet"}, {"lpips_every": 0}, {"face": -1.0}, {"mask_band": -1}]
+    "change",
+    [
+        {"lpips_network": "resnet"},
+        {"lpips_every": 0},
+        {"face": -1.0},
+        {"mask_band": -1},
+        {"residual_width": 0},
+        {"residual_parts": ("tail",)},
+        {"residual_place": "nowhere"},
+        {"plane_learning_rate": -1e-3},
+        {"scale": 0.0},
+    ],
 )
 def test_settings_that_cannot_work_are_refused(change):
     with pytest.raises(ValueError, match=f"train.{next(iter(change))} must"):
