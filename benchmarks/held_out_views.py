@@ -222,7 +222,9 @@ def _epipolar(first: Watched, other: Watched, order: np.ndarray) -> np.ndarray:
     lines = np.cross(epipole, rays @ to_other.T)
     points = other.pixels[:, order]
     distance = np.abs((lines[..., :2] * points).sum(-1) + lines[..., 2])
-    return np.where(first.seen, distance / np.linalg.norm(lines[..., :2], axis=-1), np.nan)
+    return np.where(
+        first.seen & other.seen[:, order], distance / np.linalg.norm(lines[..., :2], axis=-1), np.nan
+    )
 
 
 def _triangulated(watched: Sequence[Watched]) -> np.ndarray:

@@ -26,11 +26,13 @@ from stages.fit.views import Views
 from stages.fit.windows import Window, windows
 
 LONG_SIDE = 512.0
-_CHEST_DISTANCE = 0.22  # metres; a hand seen before the torso is nearer than the shoulders by this
-_EXPRESSION = 25.0
-_JOINT_OFFSET = 2000.0
-_FACE_LENGTH = 2000.0
-_SFACE = {"vertex": 1e4, "laplacian": 1e7, "edge": 1e4}
+CHEST_DISTANCE = 0.22  # metres; a hand seen before the torso is nearer than the shoulders by this
+INITIAL_BETAS = 0.5
+EXPRESSION = 25.0
+SHAPE = 0.05
+JOINT_OFFSET = 2000.0
+FACE_LENGTH = 2000.0
+SFACE = {"vertex": 1e4, "laplacian": 1e7, "edge": 1e4}
 _SATURATION = (40.0, 20.0, 20.0, 20.0)  # pixels, by group: body, hands, face
 
 # What holds each joint of body_pose to its initial rotation; the other joints have 0.3.
@@ -69,7 +71,7 @@ class Face:
         model = self.model
         points = model.rest + model.shape @ parameters.betas + model.face @ parameters.face_control
         found = sface(points, self.target)
-        return sum((_SFACE[name] * value.mean() for name, value in found.items()), points.new_zeros(()))
+        return sum((SFACE[name] * value.mean() for name, value in found.items()), points.new_zeros(()))
 
 
 class Objective:
@@ -190,7 +192,7 @@ class Objective:
         over = over & self.observations.mask[window.posed] & self.observations.hands
         depth = predicted.in_camera[..., 2]
         chest = (depth[:, self.shoulders[0]] + depth[:, self.shoulders[1]]) / 2
-        return 20 * (terms.in_front_loss(depth, chest, _CHEST_DISTANCE) * over).sum(1)
+        return 20 * (terms.in_front_loss(depth, chest, CHEST_DISTANCE) * over).sum(1)
 
     def _init(self, parameters: Parameters, predicted: Prediction, window: Window) -> Tensor:
         """L_init, Eq. 3, and the priors on single joints."""
@@ -205,7 +207,7 @@ class Objective:
         return (
             4 * pose.sum(1)
             + 0.45 * hands.sum(1)
-            + _EXPRESSION * expression.sum(1)
+            + EXPRESSION * expression.sum(1)
             + 200 * jaw[:, 1:].sum(1)
             + 5 * eyes.sum((1, 2))
             + 200 * eyes[..., 2].sum(1)
@@ -214,7 +216,7 @@ class Objective:
 
     def _betas(self, parameters: Parameters) -> Tensor:
         """L_init, Eq. 3, of the shape."""
-        return 0.5 * terms.initial_loss(parameters.betas, self.initial.betas).sum()
+        return INITIAL_BETAS * terms.initial_loss(parameters.betas, self.initial.betas).sum()
 
     def _vectors(self, matrices: Tensor) -> Tensor:
         """Rotation vectors of the joints that a prior looks at, zero for the others: [W, 55, 3]."""
@@ -229,10 +231,10 @@ class Objective:
         """L_sreg, Eq. 5, and the length of the face offsets."""
         face_offset = self.model.face[self.face] @ parameters.face_control
         return (
-            0.05 * terms.shape_loss(parameters.betas).sum()
-            + _JOINT_OFFSET * terms.joint_offset_loss(parameters.joint_offset).sum()
-            + _JOINT_OFFSET * terms.symmetry_loss(parameters.joint_offset, self.mirror_joints).sum()
-            + _FACE_LENGTH * terms.face_offset_loss(face_offset).sum()
+            SHAPE * terms.shape_loss(parameters.betas).sum()
+            + JOINT_OFFSET * terms.joint_offset_loss(parameters.joint_offset).sum()
+            + JOINT_OFFSET * terms.symmetry_loss(parameters.joint_offset, self.mirror_joints).sum()
+            + FACE_LENGTH * terms.face_offset_loss(face_offset).sum()
             + 500 * terms.symmetry_loss(face_offset, self.mirror_face).sum()
         )
 

@@ -64,7 +64,11 @@ class Parameters:
 
     def orthonormal(self) -> Parameters:
         """The same rotations with unit and orthogonal columns."""
-        return dataclasses.replace(self, **_rotation_groups(self.matrices))
+        return self.with_matrices(self.matrices)
+
+    def with_matrices(self, matrices: Tensor) -> Parameters:
+        """The same with other rotations, [T, 55, 3, 3]."""
+        return dataclasses.replace(self, **_rotation_groups(matrices))
 
     def rows(self, low: int, high: int) -> Parameters:
         """The frames from ``low`` to ``high`` - 1; what all frames share stays as it is."""

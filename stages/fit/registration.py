@@ -20,9 +20,9 @@ from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
-from stages.fit.optimise import optimise
-from stages.fit.parameters import landmark_model, movable_joints
-from stages.fit.pose_files import InitialPoses, initial_from_files
+from stages.fit.optimise import Watch, optimise
+from stages.fit.parameters import Parameters, landmark_model, movable_joints
+from stages.fit.pose_files import InitialPoses, initial_facing, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.solver import STEPS, solve
@@ -77,7 +77,8 @@ def register(
     """
     views = views_of(keypoints, cameras)
     size = views.size.numpy()
-    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked)
+    facing = None if start is None else initial_facing(start, body, views)
+    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
     target = fit_face(body, landmarks, keypoints, observations, views, settings, log)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
@@ -97,26 +98,31 @@ def register(
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, steps_of(settings), report)
     recorder.begin(initial)
-    if settings.solver == "lm" and settings.iterations > 0:
-        fitted = solve(objective, initial, frozen, settings.minibatch, recorder)
-    else:
-        fitted = optimise(
-            objective,
-            initial,
-            settings.iterations,
-            frozen,
-            settings.learning_rate,
-            settings.minibatch,
-            recorder,
-        )
-    with torch.no_grad():
-        matrices = torch.where(movable[:, None, None], fitted.matrices, initial.matrices)
-        rotation = continuous(roma.rotmat_to_rotvec(matrices))
-        identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
-    frames, measured = tuple(keypoints.frames.tolist()), observations.mask.any(1)
-    poses = Poses(frames, rotation, fitted.expression, fitted.transl, measured)
+    fitted = _minimised(objective, initial, frozen, settings, recorder)
+    identity, poses = _outcome(objective, fitted, spread)
     error = objective.residuals(fitted)
     return Registration(identity, poses, observations, error, recorder.curve, tuple(recorder.seconds))
+
+
+def _minimised(
+    objective: Objective, initial: Parameters, frozen: frozenset[str], settings: FitSettings, watch: Watch
+) -> Parameters:
+    """The parameters that the chosen solver arrives at."""
+    if settings.solver == "lm" and settings.iterations > 0:
+        return solve(objective, initial, frozen, settings.minibatch, watch)
+    rate, size = settings.learning_rate, settings.minibatch
+    return optimise(objective, initial, settings.iterations, frozen, rate, size, watch)
+
+
+def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[Identity, Poses]:
+    """Identity and poses; joints that nothing was seen of are where they began."""
+    observations = objective.observations
+    with torch.no_grad():
+        matrices = torch.where(objective.movable, fitted.matrices, objective.start)
+        rotation = continuous(roma.rotmat_to_rotvec(matrices))
+        identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
+    frames, measured = tuple(observations.frames.tolist()), observations.mask.any(1)
+    return identity, Poses(frames, rotation, fitted.expression, fitted.transl, measured)
 
 
 def steps_of(settings: FitSettings) -> int:

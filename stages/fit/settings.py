@@ -12,7 +12,7 @@ SOLVERS = ("adam", "lm")
 class FitSettings:
     """Settings of the fit stage; lengths in metres, angles in radians."""
 
-    iterations: int = 200  # steps of the solver over the whole clip; 0 publishes the initialisation
+    iterations: int = 200  # steps of adam over the whole clip, lm has its own; 0 publishes the initialisation
     solver: str = "adam"  # how the objective is minimised: adam or lm
     minibatch: int = 256  # frames posed at a time: memory does not grow with the clip
     learning_rate: float = 1.0  # factor on Adam's step of every group of parameters

@@ -21,7 +21,7 @@ from stages.fit.solver.coarse import softened, thinned
 from stages.fit.solver.levenberg import Levenberg, Unknowns
 from stages.fit.solver.normal import coupling_of, groups_of, normal_equations
 from stages.fit.solver.slopes import Layout, Slopes, group_of, joint_slopes, pose
-from stages.fit.solver.state import Step, between, gradient_step, moved, with_matrices
+from stages.fit.solver.state import Step, between, gradient_step, moved
 from tests.stages.fit_clip import load, make_clip
 
 BETAS = 4
@@ -292,7 +292,7 @@ def test_frames_between_are_filled_in_along_geodesics(model, clip):
     turn[0, :, 0], turn[1, :, 0] = 3.0, -3.0  # 0.28 radians apart, through pi
     few = dataclasses.replace(initial, **{name: getattr(initial, name)[:2] for name in PER_FRAME})
     few = dataclasses.replace(
-        with_matrices(few, roma.rotvec_to_rotmat(turn)), transl=torch.tensor([[0.0] * 3, [1.0] * 3])
+        few.with_matrices(roma.rotvec_to_rotmat(turn)), transl=torch.tensor([[0.0] * 3, [1.0] * 3])
     )
     filled = between(few, torch.tensor([0, 2]), torch.tensor([0.0, 1.0, 4.0]))
     torch.testing.assert_close(filled.transl[:, 0], torch.tensor([0.0, 0.25, 1.0]))
@@ -381,7 +381,7 @@ def test_body_seen_from_behind_turns_through_pi(model, clip):
     flip = roma.rotvec_to_rotmat(torch.tensor([0.0, math.pi, 0.0])) @ roma.rotvec_to_rotmat(away)
     matrices = initial.matrices.clone()
     matrices[:, 0] = flip[:, 0] @ matrices[:, 0]
-    found = solve(objective, with_matrices(initial, matrices), frozen)
+    found = solve(objective, initial.with_matrices(matrices), frozen)
     for value in found.named().values():
         assert torch.isfinite(value).all()
     assert roma.rotmat_geodesic_distance(found.matrices[1:, 0], found.matrices[:-1, 0]).max() < 0.5

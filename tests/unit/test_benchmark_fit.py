@@ -155,5 +155,5 @@ def test_tables_headline_and_files(monkeypatch, capsys, tmp_path, stage, clip):
     assert "upper 2.00 and 3.00" in lines[-1] and lines[-1].startswith("fit: ")
     record = json.loads(table.read_text())
     assert len(record["errors"]) == 3 * len(fit.VARIANTS)
-    assert {run["iterations"] for run in record["effort"]} == set(fit.QUICK_EFFORTS)
+    assert {run["iterations"] for run in record["effort"]} == {*fit.QUICK_EFFORTS, fit.STEPS}
     assert figure.read_bytes().startswith(b"\x89PNG")

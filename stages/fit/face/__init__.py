@@ -57,6 +57,8 @@ def fit_face(
     if settings.face == "off":
         log("face first: switched off")
         return None
+    if settings.face != "flame" and (settings.face_init or settings.flame_model):
+        log("face first: fit.face_init and fit.flame_model are not used: set fit.face=flame")
     with threads(1), torch.no_grad():
         model = face_model(body, landmarks.face_mesh)
         if settings.face == "flame":

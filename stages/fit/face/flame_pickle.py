@@ -51,7 +51,11 @@ class _Chumpy(_Stub):
 
 
 class _Sparse(_Stub):
-    """A scipy sparse matrix."""
+    """A scipy sparse matrix, by columns."""
+
+
+class _SparseRows(_Sparse):
+    """A scipy sparse matrix by rows."""
 
 
 class _Name(_Stub):
@@ -76,8 +80,8 @@ class _Unpickler(pickle.Unpickler):
             return _Dtype if name == "dtype" else _Name
         if module.split(".")[0] == "chumpy":
             return _Chumpy
-        if module.startswith("scipy.sparse") and name.endswith("_matrix"):
-            return _Sparse
+        if module.startswith("scipy.sparse") and name in ("csc_matrix", "csr_matrix"):
+            return _Sparse if name == "csc_matrix" else _SparseRows
         if module in ("copy_reg", "copyreg") and name == "_reconstructor":
             return lambda kind, base, state: kind() if issubclass(kind, _Stub) else _Stub()
         if module in ("__builtin__", "builtins") and name == "object":
@@ -127,7 +131,8 @@ def _array(value: Any, depth: int = 0) -> np.ndarray | None:
         shape = state.get("_shape", state.get("shape"))
         if data is None or indices is None or starts is None or not isinstance(shape, tuple):
             return None
-        return scipy.sparse.csc_matrix((data, indices, starts), shape=tuple(map(int, shape))).toarray()
+        kind = scipy.sparse.csr_matrix if isinstance(value, _SparseRows) else scipy.sparse.csc_matrix
+        return kind((data, indices, starts), shape=tuple(map(int, shape))).toarray()
     return None
 
 

@@ -8,9 +8,9 @@ these are relative to.
 
 from stages.fit.pose_files.export import write_peer_files
 from stages.fit.pose_files.read import InitialPoses, read_hand_mean, read_initial_poses
-from stages.fit.pose_files.start import initial_from_files, is_official_smplx
+from stages.fit.pose_files.start import initial_facing, initial_from_files, is_official_smplx
 
 __all__ = [
-    "InitialPoses", "initial_from_files", "is_official_smplx", "read_hand_mean", "read_initial_poses",
-    "write_peer_files",
+    "InitialPoses", "initial_facing", "initial_from_files", "is_official_smplx", "read_hand_mean",
+    "read_initial_poses", "write_peer_files",
 ]  # fmt: skip

@@ -13,7 +13,9 @@ Poses are in the axes of each frame's own camera (``pose_files.axes``). Their wo
 first frame: a camera that stands still has R = 1 and t = 0, as in their files.
 
 Coefficients mean what they mean to the body that was fitted. Tools that build the official SMPL-X
-reproduce the fit only if it was made with the official SMPL-X.
+reproduce the fit only if it was made with the official SMPL-X. They are built with 100 betas and 50
+expressions, and stop at more: what the official file has beyond (its 51st to 100th expression, the least
+of its components) is left out.
 
 Their joints differ from ours in three ways. They are regressed from a template with its face offsets,
 which is made up for in ``joint_offset``. The root joint has no offset; so the poses written turn about
@@ -77,7 +79,7 @@ def write_peer_files(
         _write_poses(fitted / name, moved, theirs[0], views, hand_mean)
     joint_offset = ours - theirs
     joint_offset[0] = 0
-    _write(fitted / "shape_param.json", _numbers(_padded(identity.betas, _BETAS)))
+    _write(fitted / "shape_param.json", _numbers(_resized(identity.betas, _BETAS)))
     _write(fitted / "face_offset.json", _numbers(identity.face_offset))
     _write(fitted / "joint_offset.json", _numbers(joint_offset))
     _write(fitted / "locator_offset.json", _numbers(torch.zeros_like(joint_offset)))
@@ -101,7 +103,7 @@ def _write_poses(folder: Path, poses: Poses, pivot: Tensor, views: list[Camera],
     local[:, 0] = root_pose
     local[:, HAND_JOINTS] -= hand_mean.double()
     columns = {name: _numbers(local[:, joints]) for name, joints in _JOINTS.items()}
-    columns |= {"expr": _numbers(_padded(poses.expression, _EXPRESSIONS)), "trans": _numbers(trans)}
+    columns |= {"expr": _numbers(_resized(poses.expression, _EXPRESSIONS)), "trans": _numbers(trans)}
     for row, frame in enumerate(poses.frames):
         _write(folder / f"{frame}.json", {name: values[row] for name, values in columns.items()})
 
@@ -121,10 +123,9 @@ def _write_cameras(folder: Path, frames: tuple[int, ...], views: list[Camera]) -
         _write(folder / f"{frame}.json", value)
 
 
-def _padded(values: Tensor, length: int) -> Tensor:
-    """[..., K] with zeros up to ``length`` numbers, where it has fewer."""
-    missing = max(length - values.shape[-1], 0)
-    return torch.nn.functional.pad(values, (0, missing))
+def _resized(values: Tensor, length: int) -> Tensor:
+    """[..., K] as ``length`` numbers: zeros are appended, or the last ones cut off."""
+    return torch.nn.functional.pad(values, (0, length - values.shape[-1]))
 
 
 def _numbers(values: Tensor) -> list:

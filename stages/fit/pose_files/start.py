@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel
+from stages.fit.facing import pose_facing
 from stages.fit.initialise import weak_perspective
 from stages.fit.observations import Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
@@ -30,6 +32,14 @@ def is_official_smplx(body: BodyModel) -> bool:
     """
     counts = body.shape_directions.shape[2], body.expression_directions.shape[2]
     return len(body.v_template) == _VERTICES and len(body.faces) == _TRIANGLES and min(counts) >= 10
+
+
+def initial_facing(start: InitialPoses, body: BodyModel, views: Views) -> np.ndarray:
+    """Whether the estimated heads look at the camera, see ``facing.pose_facing``: [T]."""
+    nowhere = torch.zeros(len(start.frames), 3)
+    orient, _ = into_world(start.rotation[:, 0], nowhere, nowhere[0], views.rotation, views.translation)
+    rotation = torch.cat([orient[:, None].to(start.rotation), start.rotation[:, 1:]], dim=1)
+    return pose_facing(rotation, body.parents, views)
 
 
 def initial_from_files(

@@ -21,7 +21,7 @@ from stages.fit.optimise import Watch, ignore
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.solver.coarse import softened, thinned
 from stages.fit.solver.levenberg import Levenberg, Unknowns
-from stages.fit.solver.state import between, with_matrices
+from stages.fit.solver.state import between
 
 _STRIDE, _FEW = 4, 16  # every fourth frame, of clips of at least 16
 
@@ -130,4 +130,4 @@ def _filled(objective: Objective, initial: Parameters, found: Parameters, rows: 
     """Parameters of all frames from those of some; joints that nothing was seen of stay where they began."""
     parameters = between(found, rows, objective.times)
     matrices = torch.where(objective.movable, parameters.matrices, initial.matrices)
-    return with_matrices(parameters, matrices)
+    return parameters.with_matrices(matrices)

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from pipeline.body.joints import BODY_POSE, JAW
-from stages.fit.objective import Objective
+from stages.fit.objective import CHEST_DISTANCE, EXPRESSION, Objective
 from stages.fit.observations import Directions
 from stages.fit.parameters import EYES, HANDS, Parameters
 from stages.fit.solver.slopes import Group, Layout, Posed, Slopes, group_of, joint_slopes, pose
 
 _ACCELERATION, _CHANGE = 400.0, 0.1  # second derivatives of the terms of ``Objective._smooth``
-_IN_FRONT, _CHEST_DISTANCE = 40.0, 0.22
+_IN_FRONT = 40.0
 _MARGIN = 0.2  # radians within a limit where its hinge counts: else steps leap over it to and fro
 
 
@@ -231,7 +231,7 @@ def _in_front(
     over &= at[..., 1] > (pixels[:, left, 1:] + pixels[:, right, 1:]) / 2
     over &= seen.mask[span][:, group.rows[hands]]
     depth = in_camera[..., 2]
-    over &= depth[:, hands] > (depth[:, left] + depth[:, right])[:, None] / 2 - _CHEST_DISTANCE
+    over &= depth[:, hands] > (depth[:, left] + depth[:, right])[:, None] / 2 - CHEST_DISTANCE
     if not over.any():
         return []
     pick = torch.zeros(len(hands), in_camera.shape[1]).to(in_camera)
@@ -258,7 +258,7 @@ def _add_priors(objective: Objective, parameters: Parameters, layout: Layout, ba
     weight, turns = objective.settings.lambda_init, layout.turns
     diagonal = bands[0].diagonal(dim1=1, dim2=2)
     diagonal[:, :turns] += weight * curvature[:, layout.joints].flatten(1)
-    diagonal[:, turns : turns + layout.expressions] += weight
+    diagonal[:, turns : turns + layout.expressions] += 2 * EXPRESSION * weight
 
 
 def _add_smoothness(

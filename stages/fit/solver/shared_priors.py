@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from stages.fit.face.target import aligned
-from stages.fit.objective import _SFACE, Face, Objective
+from stages.fit.objective import FACE_LENGTH, INITIAL_BETAS, JOINT_OFFSET, SFACE, SHAPE, Face, Objective
 from stages.fit.parameters import Parameters
 from stages.fit.solver.slopes import Layout
 
@@ -18,7 +18,7 @@ def shared_priors(objective: Objective, parameters: Parameters, layout: Layout, 
     settings = objective.settings
     priors = torch.zeros(layout.shared, layout.shared, dtype=torch.float64)
     betas = priors[: layout.betas, : layout.betas]
-    betas.diagonal().add_(frames * (0.2 * settings.lambda_sreg + settings.lambda_init))
+    betas.diagonal().add_(frames * 2 * (SHAPE * settings.lambda_sreg + INITIAL_BETAS * settings.lambda_init))
     if objective.target is not None:
         shape = objective.target.model.shape
         for axis, surface in enumerate(_surface(objective.target, parameters)):
@@ -28,7 +28,7 @@ def shared_priors(objective: Objective, parameters: Parameters, layout: Layout, 
         mirror = torch.kron(objective.mirror_joints, torch.diag(torch.tensor([-1.0, 1.0, 1.0])))
         unlike = (torch.eye(165) - mirror).double()
         offsets = priors[layout.betas :, layout.betas :]
-        offsets += 1000 * frames * settings.lambda_sreg * (torch.eye(165) + unlike.mT @ unlike)
+        offsets += 2 * JOINT_OFFSET * frames * settings.lambda_sreg * (torch.eye(165) + unlike.mT @ unlike)
     # No direction is without curvature, whatever the priors' weights.
     priors.diagonal().add_(1e-6)
     return priors
@@ -40,7 +40,7 @@ def control_priors(objective: Objective, parameters: Parameters, frames: int) ->
     priors = []
     for sign in (-1.0, 1.0, 1.0):
         unlike = face - sign * (objective.mirror_face @ face)
-        squares = 4000 * face.mT @ face + 1000 * unlike.mT @ unlike
+        squares = 2 * FACE_LENGTH * face.mT @ face + 1000 * unlike.mT @ unlike
         priors.append(frames * settings.lambda_sreg * squares)
     if objective.target is not None:
         spread = objective.target.model.face
@@ -62,6 +62,6 @@ def _surface(face: Face, parameters: Parameters) -> list[Tensor]:
     sides = torch.zeros(len(edges), count)
     sides[torch.arange(len(edges)), edges[:, 0]] = 1
     sides[torch.arange(len(edges)), edges[:, 1]] = -1
-    smooth = 2 * _SFACE["laplacian"] / count * target.laplacian.mT @ target.laplacian
-    smooth = smooth + _SFACE["edge"] / (3 * max(len(edges), 1) * _NEAR) * sides.mT @ sides
-    return [smooth + torch.diag(_SFACE["vertex"] / count / away[:, axis]) for axis in range(3)]
+    smooth = 2 * SFACE["laplacian"] / count * target.laplacian.mT @ target.laplacian
+    smooth = smooth + SFACE["edge"] / (3 * max(len(edges), 1) * _NEAR) * sides.mT @ sides
+    return [smooth + torch.diag(SFACE["vertex"] / count / away[:, axis]) for axis in range(3)]

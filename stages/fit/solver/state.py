@@ -8,8 +8,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.body.joints import BODY_POSE, GLOBAL_ORIENT, JAW
-from stages.fit.parameters import EYES, HANDS, ROTATIONS, Parameters
+from stages.fit.parameters import ROTATIONS, Parameters
 
 _MOST = 0.6  # radians a joint turns in one step: beyond, the linearisation says nothing
 
@@ -33,14 +32,6 @@ class Step:
     betas: Tensor
     joint_offset: Tensor
     face_control: Tensor
-
-
-def with_matrices(parameters: Parameters, matrices: Tensor) -> Parameters:
-    """The same parameters with other rotations, [T, 55, 3, 3]."""
-    six = matrices[..., :2].flatten(-2)
-    parts = (GLOBAL_ORIENT, BODY_POSE, slice(JAW, JAW + 1), EYES, HANDS)
-    groups = {name: six[:, part] for name, part in zip(ROTATIONS, parts, strict=True)}
-    return dataclasses.replace(parameters, **groups)
 
 
 def gradient_step(parameters: Parameters, gradient: Parameters) -> Step:
@@ -73,7 +64,7 @@ def moved(parameters: Parameters, step: Step, share: Tensor) -> Parameters:
     length = step.rotation.norm(dim=-1, keepdim=True)
     turn = step.rotation * (_MOST / length.clamp_min(_MOST)) * share[:, None, None]
     common = share.mean()
-    turned = with_matrices(parameters, parameters.matrices @ roma.rotvec_to_rotmat(turn))
+    turned = parameters.with_matrices(parameters.matrices @ roma.rotvec_to_rotmat(turn))
     return dataclasses.replace(
         turned,
         expression=parameters.expression + share[:, None] * step.expression,
@@ -103,4 +94,4 @@ def between(parameters: Parameters, known: Tensor, times: Tensor) -> Parameters:
         name: torch.lerp(getattr(parameters, name)[before], getattr(parameters, name)[after], share)
         for name in ("expression", "transl")
     }
-    return with_matrices(dataclasses.replace(parameters, **mixed), turned)
+    return dataclasses.replace(parameters, **mixed).with_matrices(turned)

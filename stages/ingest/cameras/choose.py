@@ -66,7 +66,7 @@ def choose_cameras(context: Context, clip: Clip, detected: Detected, given: Cali
         return _from_calibration(context, clip, detected, given)
     record: dict[str, Any] = {"source": "pinhole", "displacement": None, "metres_per_unit": None}
     if settings.cameras == "auto":
-        motion = measure_motion(context.output, frames, clip.fps)
+        motion = measure_motion(context.output, frames, kept_rate(context, clip))
         context.log(str(motion))
         record["displacement"] = round(motion.displacement, 6) if motion.pairs else None
     if settings.cameras == "sfm" or (settings.cameras == "auto" and motion.moving):
@@ -81,13 +81,18 @@ def choose_cameras(context: Context, clip: Clip, detected: Detected, given: Cali
     return Chosen(dict.fromkeys(frames, camera), {}, record)
 
 
+def kept_rate(context: Context, clip: Clip) -> float:
+    """Kept frames a second: of a clip of which every ``ingest.stride``-th frame is read."""
+    return (clip.fps or 25.0) / context.settings.stride
+
+
 def _find(context: Context, clip: Clip, detected: Detected) -> Chosen | None:
     """Cameras from the background's motion; None where it gives none."""
     frames = [int(frame) for frame in detected.keypoints.frames]
     width, height = detected.width, detected.height
     focal = context.settings.focal * max(width, height)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    share = unexplained_by_turns(context.output, frames, clip.fps, matrix)
+    share = unexplained_by_turns(context.output, frames, kept_rate(context, clip), matrix)
     if share > ONLY_TURNS:
         centre = (width / 2, height / 2)
         found = structure_from_motion(context.output, context.work / "sfm", frames, focal, centre)
@@ -117,7 +122,7 @@ def _from_model(
     longest = max(GAP_SECONDS * (clip.fps or 25.0), 3 * float(np.diff(mapped).max(initial=1)))
     poses = fill_gaps({f: (v.rotation, v.translation) for f, v in known.items()}, frames, int(longest))
     views = {frame: View(lens, *pose) for frame, pose in poses.items()}
-    scaled, scale = _metric(context, detected.keypoints, views, clip.fps, model)
+    scaled, scale = _metric(context, detected.keypoints, views, kept_rate(context, clip), model)
     context.log(
         f"cameras: structure from motion placed {len(known)} of {len(mapped)} frames, focal length "
         f"{lens.mean_focal_length():.0f} pixels; {scale.note}"
@@ -152,7 +157,7 @@ def _from_calibration(context: Context, clip: Clip, detected: Detected, given: C
         )
     scale = Scale(1.0, "metres as given")
     if not given.metric:
-        views, scale = _metric(context, detected.keypoints, views, clip.fps, given)
+        views, scale = _metric(context, detected.keypoints, views, kept_rate(context, clip), given)
     bent = {number: distortion(lens) for number, lens in {id(v.lens): v.lens for v in views.values()}.items()}
     lenses = {f: v.lens for f, v in views.items() if bent[id(v.lens)] > LEFT_ALONE}
     context.log(

@@ -79,8 +79,8 @@ def undistort(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Ke
 
     Args:
         output: the folder with ``frames`` and ``masks``.
-        lenses: frame number -> lens of the stored frames.
-        keypoints: of the same frames.
+        lenses: frame number -> lens of the stored frame; frames without one are left as they are.
+        keypoints: of all frames.
 
     Returns:
         The keypoints of the straightened frames; points that left the picture have lost their scores.
@@ -90,7 +90,9 @@ def undistort(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Ke
         name: getattr(keypoints, name).copy() for name in ("whole_body", "face_mesh", "pose_image", "hands")
     }
     for row, frame in enumerate(keypoints.frames.tolist()):
-        lens = lenses[frame]
+        lens = lenses.get(frame)
+        if lens is None:
+            continue
         where = maps(lens.width, lens.height, lens.model_name, tuple(lens.params))
         image = cv2.remap(read_frame(output / "frames", frame), *where, cv2.INTER_CUBIC)
         write_frame(output / "frames", frame, image)

@@ -80,6 +80,8 @@ def read_toml_rig(path: Path, name: str) -> Calibration:
         size = [int(side) for side in np.array(table["size"]).reshape(2)]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: a camera's table is not complete ({error}): export it again") from None
+    if table.get("fisheye"):
+        raise UserError(f"{path}: fisheye lenses are not known here: give undistorted footage")
     if len(bend) > 4 and np.abs(bend[4:]).max() > 0:
         raise UserError(f"{path}: of the distortions only k1, k2, p1, p2 are known here: calibrate so")
     # OpenCV counts from the centre of the first pixel.
