@@ -270,6 +270,7 @@ def run_record(context: Context, seconds: float) -> dict[str, Any]:
         peak = 0
     return {
         "seconds": round(seconds, 3),
+        "cpu_seconds": round(time.process_time(), 3),  # of all threads, imports included
         "peak_memory_mib": round(peak / 1024, 1),
         "host": platform.node(),
         "machine": platform.machine(),

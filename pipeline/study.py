@@ -1,0 +1,128 @@
+"""Studies: one subject under several settings, each a version in the store, compared in one table.
+
+A variant is a set of ``NAME=VALUE`` words on top of the study's own. What two variants share (footage,
+fit, a whole avatar that is only evaluated differently) is made once, because the store finds it by its
+key; a study that was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.artifact import RUN, Artifact
+from pipeline.errors import UserError
+from pipeline.job import Job, job_from_words
+from pipeline.stage import process_environment
+
+SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One row of a study.
+
+    Attributes:
+        name: for the table.
+        words: settings that differ from the study's own, as on the command line.
+    """
+
+    name: str
+    words: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one variant came to.
+
+    Attributes:
+        subject: whose avatar.
+        variant: its name.
+        means: split -> method -> metric -> mean over frames, as in summary.json.
+        gaussians: of the avatar.
+        seconds: stage -> wall-clock seconds of the run that made its result.
+        cpu_seconds: stage -> processor seconds of it, of all threads: less disturbed by other jobs.
+        folders: stage -> where its result lies.
+    """
+
+    subject: str
+    variant: str
+    means: Mapping[str, Any]
+    gaussians: int
+    seconds: Mapping[str, float]
+    cpu_seconds: Mapping[str, float]
+    folders: Mapping[str, Path]
+
+    def held_out(self, metric: str, method: str = "avatar") -> float:
+        """A metric's mean over the held-out frames."""
+        value = self.means["test"][method][metric]
+        return float("nan") if value is None else float(value)
+
+
+def outcome_of(subject: str, variant: Variant, words: Mapping[str, str], log: Path | None = None) -> Outcome:
+    """Runs what is not in the store yet, and reads what the variant came to.
+
+    ``latest`` is left pointing where it pointed before.
+
+    Args:
+        subject: whose avatar.
+        variant: the settings that differ.
+        words: the study's own words, which the variant's replace.
+        log: where the stages' own lines go; this terminal if None.
+
+    Raises:
+        UserError: a setting is wrong, or a stage stopped.
+    """
+    job = job_from_words(subject, {**words, **variant.words})
+    with _latest_kept(job):
+        for stage in job.stages:
+            if job.find(stage) is None:
+                _run(job, stage, log)
+        artifacts = {stage: job.find(stage) for stage in job.stages}
+    whole = {stage: artifact for stage, artifact in artifacts.items() if artifact is not None}
+    return _read(subject, variant, whole)
+
+
+def _read(subject: str, variant: Variant, artifacts: Mapping[str, Artifact]) -> Outcome:
+    folders = {stage: artifact.folder for stage, artifact in artifacts.items()}
+    records = {stage: json.loads((folder / RUN).read_text()) for stage, folder in folders.items()}
+    summary = json.loads((folders["evaluate"] / SUMMARY).read_text())
+    return Outcome(
+        subject=subject,
+        variant=variant.name,
+        means=summary["means"],
+        gaussians=summary["gaussians"],
+        seconds={stage: record["seconds"] for stage, record in records.items()},
+        cpu_seconds={stage: record.get("cpu_seconds", float("nan")) for stage, record in records.items()},
+        folders=folders,
+    )
+
+
+def _run(job: Job, stage: str, log: Path | None) -> None:
+    """Runs one stage in a process of its own."""
+    command = [sys.executable, "-m", "pipeline.stage", stage, "--subject", job.subject.name, *job.words]
+    with contextlib.ExitStack() as stack:
+        output = stack.enter_context(log.open("a")) if log is not None else None
+        done = subprocess.run(command, env=process_environment(), stdout=output, stderr=output, check=False)
+    if done.returncode:
+        told = f"; {log} says why" if log is not None else "; its own line above says why"
+        raise UserError(f"{stage}:{job.subject.name} stopped{told}")
+
+
+@contextlib.contextmanager
+def _latest_kept(job: Job) -> Iterator[None]:
+    """Puts every stage's ``latest`` back to what it was."""
+    before = {stage: job.store.latest(job.subject.name, stage) for stage in job.stages}
+    try:
+        yield
+    finally:
+        for artifact in before.values():
+            if artifact is not None and os.path.isdir(artifact.folder):
+                job.store.select(artifact)
