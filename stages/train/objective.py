@@ -10,9 +10,9 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.metrics import Lpips
-from pipeline.splat import render
+from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
-from stages.train.data import Frames, View
+from stages.train.data import Frames, Scenery, View
 from stages.train.face import face_loss, face_triangles, paste
 from stages.train.perceptual import crop, due, perceptual
 from stages.train.poses import FramePose, PoseRefinement
@@ -32,12 +32,14 @@ class Evidence:
         times: seconds of frames from the clip's start; a frame without a clock is not in it.
         texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
             no term asks for it.
+        scenery: what stands behind the person; None where no term asks for it.
     """
 
     views: Frames
     frames: tuple[int, ...]
     times: Mapping[int, float]
     texture: Tensor | None = None
+    scenery: Scenery | None = None
 
     @property
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -103,6 +105,8 @@ class Objective:
             raise ValueError("the LPIPS term needs its network")
         if settings.face and evidence.texture is None:
             raise ValueError("the face term needs a texture")
+        if settings.scenery and evidence.scenery is None:
+            raise ValueError("the scenery term needs the background")
         self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
         self.network, self.regularisers = network, Regularisers(avatar, settings)
         self._face = {id(surface): face_triangles(surface.canonical) for surface in avatar.surfaces}
@@ -157,18 +161,36 @@ class Objective:
         settings = self.settings
         rendering = render(posed.gaussians, view.camera)
         image = losses.over(rendering.color, rendering.alpha, draw.background)
-        target = view.composite(draw.background)
-        if settings.mask_band:
+        target = self._target(rendering, view, draw)
+        if settings.mask_band and not settings.mask_refine:
             image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
         terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}
-        if self.network is not None and lpips and due(draw.position, settings.lpips_every):
+        if settings.scenery and self.evidence.scenery is not None and not view.generated:
+            behind = self.evidence.scenery
+            scene = (rendering.color, rendering.alpha, behind.color, view.color, behind.known)
+            terms["scenery"] = settings.scenery * losses.before_scenery(*scene)
+        if self.network is not None and lpips and self._lpips_due(draw):
             place = crop(view.alpha, settings.lpips_crop, draw.place)
             # As many times the weight, so that its mean over the run is that of a term of every frame.
             distance = perceptual(self.network, image, target, place)
             terms["lpips"] = lpips * settings.lpips_every * distance
         return terms
+
+    def _target(self, rendering: Rendering, view: View, draw: Draw) -> Tensor:
+        """What the rendering should be: the frame's person over the drawn background."""
+        settings = self.settings
+        if not (settings.mask_band and settings.mask_refine):
+            return view.composite(draw.background)
+        trust = losses.trust(view.alpha, settings.mask_band)
+        own = rendering.alpha.detach()
+        return view.composite(draw.background, losses.refined_alpha(view.alpha, own, trust))
+
+    def _lpips_due(self, draw: Draw) -> bool:
+        settings = self.settings
+        begun = schedule.begun(settings, settings.lpips_from, draw.position // settings.batch)
+        return begun and due(draw.position, settings.lpips_every)
 
     def _face_term(self, decoded: Decoded, posed: Posed, view: View) -> Tensor:
         if self.evidence.texture is None:

@@ -20,7 +20,7 @@ from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
-from stages.train.data import Frames, person_box, spread
+from stages.train.data import Frames, person_box, scenery_of, spread
 from stages.train.loop import Trainer, describe, point_values
 from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
@@ -48,9 +48,10 @@ class Inputs:
     whole: Frames
     times: Mapping[int, float]
 
-    def evidence(self, texture: Tensor | None) -> Evidence:
+    def evidence(self, texture: Tensor | None, settings: TrainSettings) -> Evidence:
         """The training frames, and the mean colours that they show, [N, 3]."""
-        return Evidence(self.crops, self.split.train, self.times, texture)
+        scenery = scenery_of(self.crops, self.split.train) if settings.scenery else None
+        return Evidence(self.crops, self.split.train, self.times, texture, scenery)
 
 
 def run(context: Context) -> None:
@@ -74,7 +75,7 @@ def train_subject(context: Context) -> None:
     started = time.monotonic()
     avatar, visibility, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
-    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network)
+    trainer = Trainer(avatar, refinement, inputs.evidence(texture, settings), settings, network)
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()

@@ -45,7 +45,7 @@ def trainer_for(context) -> Trainer:
     inputs = stage.read_inputs(context)
     refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
     avatar, _, texture = stage.prepare(inputs, refinement, context.settings, context)
-    return Trainer(avatar, refinement, inputs.evidence(texture), context.settings)
+    return Trainer(avatar, refinement, inputs.evidence(texture, context.settings), context.settings)
 
 
 def bytes_of(folder) -> dict[str, bytes]:
