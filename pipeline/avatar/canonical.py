@@ -27,6 +27,7 @@ from pipeline.body import (
     subdivide,
     vertex_normals,
 )
+from pipeline.body.mouth import close_mouth
 
 HEAD = ("head", "face")
 HANDS = ("left_hand", "right_hand")
@@ -106,7 +107,8 @@ def build_canonical(
     Raises:
         ValueError: if ``kept`` is empty or names a vertex that the body has not.
     """
-    vertices, faces = rest_vertices(body, identity), body.faces
+    vertices = rest_vertices(body, identity)
+    faces = close_mouth(vertices, body.faces)
     if kept is None:
         kept = torch.arange(len(vertices))
     if len(kept) == 0 or int(kept.max()) >= len(vertices):
