@@ -1,50 +1,58 @@
 """What each part of the model and of the objective earns: ``python -m benchmarks.earn [--quick]``.
 
 The whole model, then the same with each part left out, on mannequins and on real clips: held-out PSNR, SSIM
-and LPIPS of the person, and processor seconds of training. A second seed of the whole model says how large
-a difference must be to mean anything. Every run is a version in the store, so that an interrupted benchmark
-goes on where it was. Small sizes (no subdivision, few iterations): a part that needs a long run to pay
-shows less here than it is worth.
+and LPIPS of the person, PSNR of face and hands, and processor seconds of training. A second seed of the whole
+model says how large a difference must be to mean anything. With ``--json FILE`` what the file holds is not
+computed again, so that an interrupted benchmark goes on where it was. Small sizes (no subdivision, few
+iterations, small pictures): a part that needs a long run to pay shows less here than it is worth.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.machine import described
-from pipeline.study import Outcome, Variant, outcome_of
+import cv2
+import numpy as np
+
+from benchmarks.machine import described, prepare
+from benchmarks.training import Clip, trained
+from pipeline.frames import read_frame, write_png
+from pipeline.job import job_from_words
+from pipeline.metrics import Lpips
+from pipeline.study import made
+from stages.evaluate.scoring import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 REAL = ("smile", "oliver", "carphone", "balance")
-METRICS = {"psnr": 1, "psnr_interior": 1, "ssim": 100, "lpips_alex": 100}
+METRICS = {"psnr": 1, "psnr_interior": 1, "ssim": 100, "lpips_alex": 100, "psnr_face": 1, "psnr_hands": 1}
 """What is compared, and the factor that tables show it with."""
 
-WHOLE, NOISE = "whole", "another seed"
+WHOLE, NOISE, RESIDUALS = "whole", "another seed", "residual colours"
+HELD_OUT = 8  # frames that are scored
+CROP_HEIGHT = 160  # pixels of a picture of face or hand
 
 BASE = {
-    "train.iterations": "400",
+    "ingest.long_side": "320",
+    "train.iterations": "200",
     "train.subdivisions": "0",
-    "train.lpips": "0.2",
+    "train.lpips": "0.05",
     "train.face": "0.8",
-    "evaluate.training_frames": "1",
-    "evaluate.comparison_frames": "1",
-    "evaluate.turntable_frames": "4",
+    "train.held_out_frames": "0",
 }
-"""The quick preset with every term of the paper's objective, without subdivision."""
+"""The quick preset with every term of the paper's objective, small, without subdivision."""
 
-PARTS = {
+PARTS: Mapping[str, Mapping[str, str]] = {
     "pose heads": {"train.pose_heads_from": "1"},
-    "residual colours": {"train.residual_from": "1"},
+    RESIDUALS: {"train.residual_from": "1"},
     "face loss": {"train.face": "0"},
     "LPIPS": {"train.lpips": "0"},
-    "SSIM": {"train.ssim": "0"},
     "pose refinement": {"train.refine_poses": "false"},
+    "SSIM": {"train.ssim": "0"},
     "noise on the pose": {"train.pose_noise": "0"},
     "first colours": {"train.initial_color": "false"},
     "smooth offsets": {"train.laplacian_offset": "0", "train.laplacian_offset_face": "0"},
@@ -57,7 +65,7 @@ PARTS = {
 }
 """What is left out, a variant each."""
 
-ADDED = {
+ADDED: Mapping[str, Mapping[str, str]] = {
     "hands inwards": {"train.hand_normal": "1"},
     "small scales": {"train.scale_size": "1", "train.scale_size_hands": "1000"},
     "one colour a hand": {"train.hand_color": "0.01"},
@@ -65,105 +73,139 @@ ADDED = {
 }
 """The paper's regularisers that the quick preset leaves out: added, a variant each."""
 
+VARIANTS: Mapping[str, Mapping[str, str]] = {WHOLE: {}, NOISE: {"train.seed": "1"}, **PARTS, **ADDED}
+QUICK = (WHOLE, NOISE, "pose heads", "LPIPS")
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """A variant over all subjects.
+Numbers = dict[str, float]
+Table = dict[str, dict[str, Numbers]]
+"""Variant -> subject -> metric, or ``seconds`` -> value."""
 
-    Attributes:
-        variant: its name.
-        gain: metric -> subject -> what the part gives: whole minus variant, or variant minus whole for
-            what is added; LPIPS with its sign turned, so that more is always better.
-        cost: subject -> processor seconds that it takes, as a share of the variant without it.
+
+def numbers_of(subject: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
+    """Trains one variant on one subject and scores it."""
+    job = job_from_words(subject, words)
+    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
+    done = trained(job)
+    clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
+    scores = clip.scores(done.avatar, Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")}))
+    hands = [scores[name] for name in ("psnr_left_hand", "psnr_right_hand") if name in scores]
+    scores["psnr_hands"] = statistics.fmean(hands) if hands else math.nan
+    if pictures is not None:
+        write_crops(pictures, clip, done.avatar)
+    return {name: scores.get(name, math.nan) for name in METRICS} | {"seconds": done.seconds}
+
+
+def write_crops(path: Path, clip: Clip, avatar) -> None:
+    """Writes face and hands of the held-out frames, as filmed above the avatar's."""
+    rows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for frame in clip.test[:: max(1, len(clip.test) // 3)]:
+        filmed = read_frame(clip.ingest / "frames", frame)
+        shown = (255 * clip.render(avatar, frame).color.clamp(0, 1)).byte().numpy()
+        for box in clip.crops(frame).values():
+            for row, image in zip(rows, (filmed, shown), strict=True):
+                width = max(1, round(CROP_HEIGHT * image[box].shape[1] / image[box].shape[0]))
+                row.append(cv2.resize(image[box], (width, CROP_HEIGHT), interpolation=cv2.INTER_CUBIC))
+    if rows[0]:
+        write_png(path, np.vstack([np.hstack(row) for row in rows]))
+
+
+def gains(variant: str, table: Table, metric: str, subjects: Iterable[str]) -> Numbers:
+    """What a part gives to a metric on each subject; more is better for all, LPIPS's sign is turned.
+
+    The whole model less the variant, or for what is added the variant less the whole.
     """
-
-    variant: str
-    gain: Mapping[str, Mapping[str, float]]
-    cost: Mapping[str, float]
-
-
-def variants(quick: bool) -> tuple[Variant, ...]:
-    """The whole model, the whole with another seed, and each part's variant."""
-    chosen = {name: PARTS[name] for name in ("pose heads", "LPIPS")} if quick else {**PARTS, **ADDED}
-    return (
-        Variant(WHOLE),
-        Variant(NOISE, {"train.seed": "1"}),
-        *(Variant(name, words) for name, words in chosen.items()),
-    )
+    sign = (-1 if variant in ADDED else 1) * (-1 if metric.startswith("lpips") else 1)
+    whole, other = table[WHOLE], table[variant]
+    return {one: sign * (whole[one][metric] - other[one][metric]) for one in subjects if one in other}
 
 
-def row_of(variant: str, whole: Sequence[Outcome], others: Sequence[Outcome]) -> Row:
-    """What a part gives and costs, from the outcomes of the same subjects with and without it."""
-    sign = -1.0 if variant in ADDED else 1.0
-    gain: dict[str, dict[str, float]] = {metric: {} for metric in METRICS}
-    cost = {}
-    for one, other in zip(whole, others, strict=True):
-        for metric in METRICS:
-            better = -sign if metric.startswith("lpips") else sign
-            gain[metric][one.subject] = better * (one.held_out(metric) - other.held_out(metric))
-        pair = (one, other) if variant not in ADDED else (other, one)
-        cost[one.subject] = pair[0].cpu_seconds["train"] / pair[1].cpu_seconds["train"] - 1
-    return Row(variant, gain, cost)
+def costs(variant: str, table: Table, subjects: Iterable[str]) -> Numbers:
+    """How much longer training takes with a part than without it, as a share."""
+    pair = (variant, WHOLE) if variant in ADDED else (WHOLE, variant)
+    seconds = [{one: table[name][one]["seconds"] for one in table[name]} for name in pair]
+    return {one: seconds[0][one] / seconds[1][one] - 1 for one in subjects if one in table[variant]}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run what the store does not hold, print the tables and one headline line."""
+    """Train every variant on every subject, print a table and one headline line."""
     options = _options(arguments)
-    subjects = options.subjects or (("mannequin_head",) if options.quick else (*MANNEQUINS, *REAL))
-    words = {**BASE, **({"train.iterations": "60"} if options.quick else {})}
-    print(f"{described()}; {words['train.iterations']} iterations, no subdivision")
-    outcomes: dict[str, list[Outcome]] = {}
-    for variant in variants(options.quick):
+    if arguments is None:
+        prepare("benchmarks.earn", 1)
+    subjects = options.subjects or (MANNEQUINS[2:] if options.quick else (*MANNEQUINS, *REAL))
+    variants = options.variants or (QUICK if options.quick else tuple(VARIANTS))
+    words = {**BASE, **({"train.iterations": "40"} if options.quick else {})}
+    sizes = f"{words['train.iterations']} iterations, no subdivision, {words['ingest.long_side']} px"
+    print(f"{described()}; {sizes}")
+    table: Table = _read(options.json)
+    for variant in dict.fromkeys((WHOLE, *variants)):
         for subject in subjects:
-            outcomes.setdefault(variant.name, []).append(outcome_of(subject, variant, words, options.log))
-        print(_line(variant.name, outcomes[variant.name]), flush=True)
-    rows = [row_of(name, outcomes[WHOLE], others) for name, others in outcomes.items() if name != WHOLE]
-    print(_table(rows, subjects))
-    if options.json is not None:
-        record = {"subjects": subjects, "words": words, "rows": [dataclasses.asdict(row) for row in rows]}
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
-    print(_headline(rows))
+            done = table.setdefault(variant, {})
+            if subject not in done:
+                wanted = options.pictures and variant in (WHOLE, RESIDUALS)
+                picture = options.pictures / f"{subject}_{variant}.png" if wanted else None
+                done[subject] = numbers_of(subject, {**words, **VARIANTS[variant]}, picture)
+                _write(options.json, table)
+        print(_line(variant, table[variant]), flush=True)
+    shown = [name for name in table if name != WHOLE and set(subjects) & set(table[name])]
+    print(_markdown(shown, table, subjects))
+    print(_headline(shown, table, subjects))
 
 
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.earn", description="What each part earns.")
-    parser.add_argument("--quick", action="store_true", help="one mannequin, two parts, 60 iterations")
+    parser.add_argument("--quick", action="store_true", help="one mannequin, two parts, 40 iterations")
     parser.add_argument("--subjects", nargs="+", metavar="NAME", help="whose avatars")
-    parser.add_argument("--log", type=Path, metavar="FILE", help="where the stages' own lines go")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every number there")
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), metavar="NAME", help="which parts")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write crops of face and hands there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="every number; read first if it is there")
     return parser.parse_args(arguments)
 
 
-def _line(name: str, outcomes: Sequence[Outcome]) -> str:
+def _read(path: Path | None) -> Table:
+    return json.loads(path.read_text()) if path is not None and path.is_file() else {}
+
+
+def _write(path: Path | None, table: Table) -> None:
+    if path is not None:
+        path.write_text(json.dumps(table, indent=1) + "\n")
+
+
+def _line(name: str, subjects: Mapping[str, Numbers]) -> str:
     """A variant's absolute numbers, so that a long run can be watched."""
     cells = [
-        f"{one.subject} {one.held_out('psnr'):.2f} dB {100 * one.held_out('lpips_alex'):.2f} "
-        f"{one.cpu_seconds['train']:.0f} s"
-        for one in outcomes
+        f"{subject} {one['psnr']:.2f} dB {100 * one['lpips_alex']:.2f} {one['seconds']:.0f} s"
+        for subject, one in subjects.items()
     ]
     return f"{name}: {'; '.join(cells)}"
 
 
-def _table(rows: Sequence[Row], subjects: Sequence[str]) -> str:
-    """Markdown: PSNR that a part gives on each subject, then its means over them and its cost."""
-    head = ["part", *subjects, "PSNR dB", "inside dB", "SSIM x100", "LPIPS x100", "time"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for row in rows:
-        each = [f"{row.gain['psnr'][subject]:+.2f}" for subject in subjects]
-        means = [f"{_mean(row.gain[name]) * scale:+.2f}" for name, scale in METRICS.items()]
-        lines.append("| " + " | ".join([row.variant, *each, *means, f"{_mean(row.cost):+.0%}"]) + " |")
+def _markdown(variants: Sequence[str], table: Table, subjects: Sequence[str]) -> str:
+    """PSNR that a part gives on each subject, then each metric's mean over them, and what it costs."""
+    head = [
+        "part",
+        *subjects,
+        *(f"{name} x{scale}" if scale > 1 else name for name, scale in METRICS.items()),
+    ]
+    lines = ["| " + " | ".join([*head, "time"]) + " |", "|" + "---|" * (len(head) + 1)]
+    for variant in variants:
+        psnr = gains(variant, table, "psnr", subjects)
+        cells = [f"{psnr[one]:+.2f}" if one in psnr else "" for one in subjects]
+        for metric, scale in METRICS.items():
+            cells.append(f"{scale * _mean(gains(variant, table, metric, subjects)):+.2f}")
+        cells.append(f"{_mean(costs(variant, table, subjects)):+.0%}")
+        lines.append("| " + " | ".join([variant, *cells]) + " |")
     return "\n".join(lines)
 
 
-def _headline(rows: Sequence[Row]) -> str:
-    """What earns most, what earns nothing."""
-    noise = max(abs(value) for row in rows if row.variant == NOISE for value in row.gain["psnr"].values())
-    parts = [row for row in rows if row.variant != NOISE]
-    best = max(parts, key=lambda row: _mean(row.gain["psnr"]))
-    idle = [row.variant for row in parts if max(row.gain["psnr"].values()) <= noise]
+def _headline(variants: Sequence[str], table: Table, subjects: Sequence[str]) -> str:
+    """What earns most, and what earns no more anywhere than another seed does."""
+    psnr = {name: gains(name, table, "psnr", subjects) for name in variants}
+    noise = max((abs(value) for value in psnr.pop(NOISE, {}).values()), default=math.nan)
+    best = max(psnr, key=lambda name: _mean(psnr[name]))
+    idle = [name for name, each in psnr.items() if max(each.values()) <= noise]
     return (
-        f"{best.variant} earns most: {_mean(best.gain['psnr']):+.2f} dB; no more than the seed "
-        f"({noise:.2f} dB) anywhere: {', '.join(idle) or 'nothing'}"
+        f"{best} earns most: {_mean(psnr[best]):+.2f} dB; nowhere more than another seed "
+        f"({noise:.2f} dB): {', '.join(idle) or 'none'}"
     )
 
 

@@ -16,7 +16,6 @@ import argparse
 import dataclasses
 import json
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,21 +25,18 @@ import torch
 from torch import Tensor
 
 from benchmarks.machine import described, prepare
-from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import load_body, read_poses
+from benchmarks.training import Clip, trained
+from pipeline.avatar import Avatar
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.job import Job, job_from_words
+from pipeline.job import job_from_words
 from pipeline.metrics.image import psnr
 from pipeline.metrics.protocol import composite, interior
-from pipeline.records import read_cameras, read_split
-from pipeline.splat import render
-from pipeline.stage import Context
-from stages.train import run as train
+from pipeline.study import made
 
 SUBJECTS = ("mannequin_upper", "mannequin_head")
 BLEED, WOBBLE, SOFT = 2.5, 2.0, 1.5  # pixels: outwards, standard deviation of the edge, width of the edge
 BAND = 6  # pixels on either side of the silhouette that the outline is judged in
-BASE = {"train.iterations": "400", "train.subdivisions": "0"}
+BASE = {"train.iterations": "200", "train.held_out_frames": "0", "train.subdivisions": "0"}
 TRUE, SOFT_MASK = "true masks", "soft alpha"
 WAYS: Mapping[str, Mapping[str, str]] = {
     TRUE: {},
@@ -119,41 +115,13 @@ def wear_masks(source: Path, target: Path, cut: bool, seed: int = 0) -> None:
         write_png(target / file.name, np.where(one > 127, 255, 0).astype(np.uint8) if cut else one)
 
 
-def trained(job: Job, ingest: Path, fit: Path, output: Path) -> tuple[Avatar, float]:
-    """Trains on other folders than the store's; the avatar and its processor seconds."""
-    upstream = {name: job.find(name) for name in job.stages["train"].needs}
-    inputs = {name: artifact.folder for name, artifact in upstream.items() if artifact is not None}
-    output.mkdir(parents=True)
-    workspace = job.workspace
-    context = Context(
-        subject=job.subject.name,
-        settings=job.settings["train"],
-        inputs={**inputs, "ingest": ingest, "fit": fit},
-        assets={},
-        source=None,
-        body=workspace.body,
-        body_file=workspace.body_file,
-        output=output,
-        work=output,
-        stage="train",
-    )
-    start = time.process_time()
-    train.run(context)
-    avatar = load_avatar(output / "avatar.safetensors", load_body(workspace.body_file))
-    return avatar, time.process_time() - start
-
-
 def judge(avatar: Avatar, ingest: Path, fit: Path) -> dict[str, float]:
     """Compares an avatar with a mannequin's held-out frames and true masks."""
-    cameras, poses = read_cameras(ingest / "cameras.parquet"), read_poses(fit / "poses.parquet")
-    rows = {frame: row for row, frame in enumerate(poses.frames)}
+    clip = Clip.read(ingest, fit, most=10**6)  # every frame: shimmer is a difference of neighbours
     found: dict[str, list[float]] = {}
     last: Tensor | None = None
-    for frame in read_split(ingest / "split.json").test:
-        row, mask = rows[frame], read_mask(ingest / "masks", frame)
-        with torch.no_grad():
-            pose = (poses.rotation[row], poses.expression[row], poses.transl[row])
-            shown = render(avatar.gaussians(*pose), cameras[frame])
+    for frame in clip.test:
+        mask, shown = read_mask(ingest / "masks", frame), clip.render(avatar, frame)
         truth, image = composite(read_frame(ingest / "frames", frame), mask), shown.color.clamp(0, 1)
         true_alpha, inside = torch.from_numpy(mask).float() / 255, interior(mask)
         element = np.ones((2 * BAND + 1, 2 * BAND + 1), np.uint8)
@@ -177,10 +145,7 @@ def judge(avatar: Avatar, ingest: Path, fit: Path) -> dict[str, float]:
 def try_way(subject: str, way: str, words: Mapping[str, str], folder: Path) -> Judgement:
     """Trains one way on one mannequin's worn masks, and judges it."""
     job = job_from_words(subject, {**words, **WAYS[way]})
-    found = job.find("ingest")
-    if found is None:
-        raise SystemExit(f"{subject} is not there yet: doit run fit:{subject}")
-    truth, given, fit = found.folder, folder / "ingest", folder / "fit"
+    truth, given, fit = made(job, ["ingest"])["ingest"].folder, folder / "ingest", folder / "fit"
     for place in (given, fit):
         place.mkdir(parents=True)
     for entry in truth.iterdir():
@@ -190,8 +155,8 @@ def try_way(subject: str, way: str, words: Mapping[str, str], folder: Path) -> J
     (fit / "poses.parquet").symlink_to(truth / "truth_poses.parquet")
     if way != TRUE:
         wear_masks(truth / "masks", given / "masks", way == "cut at one half")
-    avatar, seconds = trained(job, given, fit, folder / "output")
-    return Judgement(subject, way, **judge(avatar, truth, fit), seconds=seconds)
+    done = trained(job, ingest=given, fit=fit)
+    return Judgement(subject, way, **judge(done.avatar, truth, fit), seconds=done.seconds)
 
 
 def main(arguments: list[str] | None = None) -> None:

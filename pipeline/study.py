@@ -13,7 +13,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,14 +80,35 @@ def outcome_of(subject: str, variant: Variant, words: Mapping[str, str], log: Pa
     Raises:
         UserError: a setting is wrong, or a stage stopped.
     """
-    job = job_from_words(subject, {**words, **variant.words})
+    return _read(subject, variant, made(job_from_words(subject, {**words, **variant.words}), log=log))
+
+
+def made(job: Job, stages: Iterable[str] | None = None, log: Path | None = None) -> dict[str, Artifact]:
+    """The results of some stages and of all that they need; what is not in the store is run first.
+
+    ``latest`` is left pointing where it pointed before.
+
+    Args:
+        job: whose, and under which settings.
+        stages: names; all of them if None.
+        log: where the stages' own lines go; this terminal if None.
+
+    Raises:
+        UserError: a stage stopped.
+    """
+    wanted = set(job.stages if stages is None else stages)
+    for stage in reversed(job.stages):
+        wanted |= set(job.stages[stage].needs) if stage in wanted else set()
+    found = {}
     with _latest_kept(job):
-        for stage in job.stages:
+        for stage in (name for name in job.stages if name in wanted):
             if job.find(stage) is None:
                 _run(job, stage, log)
-        artifacts = {stage: job.find(stage) for stage in job.stages}
-    whole = {stage: artifact for stage, artifact in artifacts.items() if artifact is not None}
-    return _read(subject, variant, whole)
+            artifact = job.find(stage)
+            if artifact is None:
+                raise UserError(f"{stage}:{job.subject.name} ran, and its result is not in the store")
+            found[stage] = artifact
+    return found
 
 
 def _read(subject: str, variant: Variant, artifacts: Mapping[str, Artifact]) -> Outcome:

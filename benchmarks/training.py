@@ -1,0 +1,169 @@
+"""What benchmarks that train share: a run of the train stage in this process, and its score."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Avatar, load_avatar
+from pipeline.body import load_body, read_poses
+from pipeline.camera import Camera
+from pipeline.frames import read_frame, read_mask
+from pipeline.job import Job
+from pipeline.keypoints import COUNT, FACE, LEFT_HAND, RIGHT_HAND, read_keypoints
+from pipeline.metrics.image import psnr
+from pipeline.metrics.protocol import composite, interior
+from pipeline.records import read_cameras, read_footage, read_split
+from pipeline.splat import Rendering, render
+from pipeline.stage import Context
+from pipeline.study import made
+from stages.evaluate.scoring import Scorer
+from stages.train import run as train
+
+CROPS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
+SEEN, SMALLEST = 0.4, 8  # score from which a keypoint is seen; pixels along a side of a crop
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A finished avatar and what it took.
+
+    Attributes:
+        avatar: ready to be posed.
+        seconds: processor seconds of all threads, from reading the inputs to writing the avatar.
+        curve: the bytes of ``curve.parquet``.
+    """
+
+    avatar: Avatar
+    seconds: float
+    curve: bytes
+
+
+def trained(job: Job, **instead: Path) -> Trained:
+    """Runs the train stage in this process; what it needs is made by the store first.
+
+    Args:
+        job: whose avatar, and under which settings.
+        instead: folders that stand in for upstream stages' published ones.
+    """
+    upstream = made(job, job.stages["train"].needs)
+    demands = job.stages["train"].demands(job.settings["train"])
+    with tempfile.TemporaryDirectory() as folder:
+        places = {name: Path(folder) / name for name in ("output", "work")}
+        for place in places.values():
+            place.mkdir()
+        context = Context(
+            subject=job.subject.name,
+            settings=job.settings["train"],
+            inputs={**{name: one.folder for name, one in upstream.items()}, **instead},
+            assets={asset: job.workspace.assets / asset for asset in demands.assets},
+            source=None,
+            body=job.workspace.body,
+            body_file=job.workspace.body_file,
+            stage="train",
+            **places,
+        )
+        start = time.process_time()
+        with contextlib.redirect_stdout(io.StringIO()):
+            train.run(context)
+        seconds = time.process_time() - start
+        avatar = load_avatar(context.output / "avatar.safetensors", load_body(context.body_file))
+        return Trained(avatar, seconds, (context.output / "curve.parquet").read_bytes())
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """Frames that an avatar is judged by.
+
+    Attributes:
+        ingest: where they lie.
+        cameras: a camera a frame.
+        pose: rotation, expression and translation of a frame, as fitted.
+        seconds: a frame's time, where it has one.
+        keypoints: a frame's [133, 3], x, y in pixels and score.
+        test: the held-out frames, at most as many as asked for, evenly spread.
+    """
+
+    ingest: Path
+    cameras: Mapping[int, Camera]
+    pose: Callable[[int], tuple[Tensor, Tensor, Tensor]]
+    seconds: Mapping[int, float]
+    keypoints: Mapping[int, np.ndarray]
+    test: tuple[int, ...]
+
+    @classmethod
+    def read(cls, ingest: Path, fit: Path, most: int) -> Clip:
+        """Reads what ingest and fit published."""
+        cameras, poses = read_cameras(ingest / "cameras.parquet"), read_poses(fit / "poses.parquet")
+        rows = {frame: row for row, frame in enumerate(poses.frames)}
+        test = read_split(ingest / "split.json").test
+        step = max(1, -(-len(test) // most))
+        seconds = dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False))
+
+        found = read_keypoints(ingest / "keypoints.parquet")
+        keypoints = dict(zip(found.frames.tolist(), found.whole_body, strict=True))
+
+        def pose(frame: int) -> tuple[Tensor, Tensor, Tensor]:
+            row = rows[frame]
+            return poses.rotation[row], poses.expression[row], poses.transl[row]
+
+        return cls(ingest, cameras, pose, seconds, keypoints, test[::step])
+
+    @torch.no_grad()
+    def render(self, avatar: Avatar, frame: int) -> Rendering:
+        """The avatar as a frame's camera sees it in that frame's fitted pose."""
+        gaussians = avatar.gaussians(*self.pose(frame), self.seconds.get(frame))
+        return render(gaussians, self.cameras[frame])
+
+    def scores(self, avatar: Avatar, scorer: Scorer) -> dict[str, float]:
+        """Each metric's mean over the held-out frames, the person on black."""
+        total: dict[str, list[float]] = {}
+        for frame in self.test:
+            mask = read_mask(self.ingest / "masks", frame)
+            truth = scorer.picture(composite(read_frame(self.ingest / "frames", frame), mask))
+            shown = scorer.picture(self.render(avatar, frame).color.clamp(0, 1))
+            for name, value in scorer.values(shown, truth, interior(mask)).items():
+                total.setdefault(name, []).append(value)
+            for name, box in self.crops(frame).items():
+                value = psnr(shown.image[box], truth.image[box])
+                total.setdefault(f"psnr_{name}", []).append(value)
+        return {name: sum(values) / len(values) for name, values in total.items()}
+
+    def crops(self, frame: int) -> dict[str, tuple[slice, slice]]:
+        """Rows and columns around the face and around each hand, of those that were detected."""
+        points = self.keypoints.get(frame, np.zeros((COUNT, 3)))
+        size = read_mask(self.ingest / "masks", frame).shape
+        found = {}
+        for name, rows in CROPS.items():
+            box = crop_box(points[rows], size)
+            if box is not None:
+                found[name] = box
+        return found
+
+
+def crop_box(points: np.ndarray, size: tuple[int, int]) -> tuple[slice, slice] | None:
+    """Rows and columns around keypoints with a fifth to spare on each side; None where few are seen.
+
+    Args:
+        points: [K, 3], x, y in pixels and score.
+        size: rows and columns of the picture.
+    """
+    seen = points[points[:, 2] >= SEEN, :2]
+    if len(seen) < len(points) / 2:
+        return None
+    low, high = seen.min(0), seen.max(0)
+    spare = 0.2 * (high - low)
+    low = np.clip(np.floor(low - spare), 0, None).astype(int)
+    high = np.minimum(np.ceil(high + spare), size[::-1]).astype(int)
+    if (high - low).min() < SMALLEST:
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
