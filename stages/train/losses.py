@@ -9,6 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from pipeline.avatar.sparse import SparsePair
+from stages.train.ssim import fused_ssim
 
 WINDOW = 11  # pixels, of SSIM's Gaussian window
 SIGMA = 1.5  # pixels
@@ -24,14 +25,24 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     """One minus the structural similarity of two images, scalar (L_ssim).
 
     Wang et al. 2004 with a Gaussian window of 11 pixels and sigma 1.5 and the image mirrored at its
-    border, the mean over all pixels, as torchmetrics takes it.
-
-    The five local moments are one grouped convolution with a single batch entry: the same as a
-    batch of single-channel images takes twenty times as long on a CPU.
+    border, the mean over all pixels, as torchmetrics takes it. On a CPU one fused kernel (see
+    ``ssim.py``) where the target needs no gradient; elsewhere ``plain_ssim``.
 
     Args:
         image: [H, W, 3] in [0, 1], at least 11 pixels along each side.
         target: [H, W, 3].
+    """
+    known = image.dtype == target.dtype and image.dtype in (torch.float32, torch.float64)
+    if image.device.type != "cpu" or target.requires_grad or not known:
+        return plain_ssim(image, target)
+    return fused_ssim(image, target, _window(), (C1, C2))
+
+
+def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """What ``ssim`` computes, in plain torch: [H, W, 3] twice -> scalar.
+
+    The five local moments are one grouped convolution with a single batch entry: the same as a
+    batch of single-channel images takes twenty times as long on a CPU.
     """
     both = torch.cat([image.permute(2, 0, 1), target.permute(2, 0, 1)])[None]
     x, y = functional.pad(both, [WINDOW // 2] * 4, mode="reflect").chunk(2, dim=1)
