@@ -7,9 +7,21 @@ import numpy as np
 POSE_WRISTS = (15, 16)
 """The wrists among MediaPipe's pose landmarks."""
 
+PALM = (0, 5, 9, 13, 17)
+"""The wrist and the first knuckles among the 21 points of a hand."""
+
+_PALM_BONES = tuple((0, knuckle) for knuckle in PALM[1:])
+_FINGER_BONES = tuple((a, a + 1) for first in PALM[1:] for a in range(first, first + 3))
+_LEAST_POINTS = 5  # of a hand; the rest may lie outside the picture
+_LEAST_BONES = 6  # of the fingers' twelve, for what they measure to tell a collapsed hand
+
 
 def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, threshold: float) -> np.ndarray:
     """Which hand detections to believe; detectors give no score that tells.
+
+    A hand at the picture's edge has places for the points inside alone, and they are as good as those of
+    a whole hand. So hands are judged by the points that they have, of which five are enough, and no rule
+    speaks of what is not there.
 
     A hand goes when its palm is under half or over twice the clip's median, when its fingers are under
     0.6 of the length that they show elsewhere in the clip (a hand that collapsed to a blob), when it is
@@ -25,26 +37,83 @@ def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, thresh
     Returns:
         [T, 2] bool.
     """
-    trusted = (hands[..., 3] >= threshold).mean(2) > 0.5
-    trusted &= np.isfinite(hands).all((2, 3))
-    seen = trusted.copy()
-    hands = np.nan_to_num(hands)
-    palm = np.linalg.norm(hands[:, :, 9, :3] - hands[:, :, 0, :3], axis=-1)
-    knuckles = hands[:, :, 5:, :3].reshape(len(hands), 2, 4, 4, 3)
-    fingers = np.linalg.norm(np.diff(knuckles, axis=3), axis=-1).sum((2, 3))
+    known = (hands[..., 3] >= threshold) & (hands[..., 3] > 0)
+    seen = (known.sum(2) >= _LEAST_POINTS) & np.isfinite(hands).all((2, 3))
+    trusted = seen.copy()
+    places = np.where(known[..., None], hands[..., :3], np.nan)
+    palm = _mean_length(places, _PALM_BONES, seen, 1)
+    fingers = _mean_length(places, _FINGER_BONES, seen, _LEAST_BONES)
     for side, wrist in enumerate(POSE_WRISTS):
-        if not trusted[:, side].any():
-            continue
-        usual = np.median(palm[trusted[:, side], side])
-        trusted[:, side] &= (palm[:, side] > 0.5 * usual) & (palm[:, side] < 2.0 * usual)
-        trusted[:, side] &= fingers[:, side] > 0.6 * np.quantile(fingers[seen[:, side], side], 0.9)
-        away = np.linalg.norm(hands[:, side, 0, :2] - pose[:, wrist, :2], axis=-1)
-        trusted[:, side] &= (away < 2.0 * usual + 4) | (pose[:, wrist, 3] < threshold)
-        trusted[:, side] &= ~_leaps(hands[:, side, 0, :2], trusted[:, side], 1.5 * usual)
-    double = trusted.all(1) & (_overlap(hands[:, 0, :, :2], hands[:, 1, :, :2]) > 0.5)
+        usual = _quantile(palm[seen[:, side], side], 0.5)
+        trusted[:, side] &= ~((palm[:, side] <= 0.5 * usual) | (palm[:, side] >= 2.0 * usual))
+        trusted[:, side] &= ~(fingers[:, side] <= 0.6 * _quantile(fingers[seen[:, side], side], 0.9))
+        away = _distance(places[:, side, :, :2], pose[:, wrist, :2])
+        trusted[:, side] &= ~(away >= 2.0 * usual + 4) | (pose[:, wrist, 3] < threshold)
+        middle, somewhere = _middle(places[:, side, PALM, :2])
+        trusted[:, side] &= ~_leaps(middle, trusted[:, side] & somewhere, 1.5 * usual)
+    double = trusted.all(1) & (_overlap(places[:, 0, :, :2], places[:, 1, :, :2]) > 0.5)
     farther = np.argmax(world[:, POSE_WRISTS, 2], axis=1)
     trusted[double, farther[double]] = False
     return trusted
+
+
+def _mean_length(
+    places: np.ndarray, bones: tuple[tuple[int, int], ...], seen: np.ndarray, least: int
+) -> np.ndarray:
+    """How long bones are on average.
+
+    Bones with an unknown end are taken to be what they usually are beside the others, so that a part of
+    a hand measures as the whole would.
+
+    Args:
+        places: [T, 2, 21, 3], NaN where unknown.
+        bones: pairs of points.
+        seen: [T, 2] bool, the hands that tell what is usual.
+        least: how many bones must be known.
+
+    Returns:
+        [T, 2], NaN where fewer are.
+    """
+    start, end = np.array(bones).T
+    length = np.linalg.norm(places[:, :, end] - places[:, :, start], axis=-1)
+    known = np.isfinite(length)
+    usual = np.array([_quantile(one, 0.5) for one in length[seen].T])
+    beside = np.where(known.sum(-1) >= least, np.where(known, usual, 0).sum(-1), np.nan)
+    return np.nansum(length, axis=-1) / beside * _mean(usual)
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    """Of the values that are known; NaN if none is."""
+    values = values[np.isfinite(values)]
+    return float(np.quantile(values, share)) if len(values) else np.nan
+
+
+def _mean(values: np.ndarray) -> float:
+    """Of the values that are known; NaN if none is."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else np.nan
+
+
+def _distance(hand: np.ndarray, wrist: np.ndarray) -> np.ndarray:
+    """From a hand's own wrist, or if that is not known its nearest point, to another wrist.
+
+    Args:
+        hand: [T, 21, 2], NaN where unknown.
+        wrist: [T, 2].
+
+    Returns:
+        [T], NaN where nothing is known.
+    """
+    away = np.linalg.norm(hand - wrist[:, None], axis=-1)
+    nearest = np.where(np.isfinite(away), away, np.inf).min(1)
+    away = np.where(np.isfinite(away[:, 0]), away[:, 0], nearest)
+    return np.where(np.isfinite(away), away, np.nan)
+
+
+def _middle(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of the known ones among places [T, K, 2], 0 where there is none: [T, 2], and where: [T]."""
+    count = np.isfinite(places).all(-1).sum(1)
+    return np.nansum(places, axis=1) / np.maximum(count, 1)[:, None], count > 0
 
 
 def trusted_flat_hands(
@@ -90,9 +159,16 @@ def _leaps(places: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _overlap(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Intersection over union of the boxes around two point sets: [T, K, 2] twice -> [T]."""
-    low = np.maximum(first.min(1), second.min(1))
-    high = np.minimum(first.max(1), second.max(1))
-    common = np.clip(high - low, 0, None).prod(1)
-    areas = (first.max(1) - first.min(1)).prod(1) + (second.max(1) - second.min(1)).prod(1)
+    """Intersection over union of the boxes around the known of two point sets: [T, K, 2] twice -> [T].
+
+    Unknown points are NaN. Where a set has none, 0.
+    """
+
+    def box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        known = np.isfinite(points)
+        return np.where(known, points, np.inf).min(1), np.where(known, points, -np.inf).max(1)
+
+    (low, high), (other_low, other_high) = box(first), box(second)
+    common = np.clip(np.minimum(high, other_high) - np.maximum(low, other_low), 0, None).prod(1)
+    areas = np.clip(high - low, 0, None).prod(1) + np.clip(other_high - other_low, 0, None).prod(1)
     return common / np.maximum(areas - common, 1e-9)

@@ -159,9 +159,10 @@ def _mediapipe_masks(
     pose_mask = visible(pose, threshold, sizes)
     pose_mask[:, POSE_FACE] &= ~seen_face[:, None]
     drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES)
-    for side, doubles in enumerate(POSE_OF_HAND):
-        pose_mask[:, doubles] &= ~seen_hand[:, side, None]
     hand_mask = visible(hands, threshold, sizes) & seen_hand[..., None]
+    for side, (wrist, *fingers) in enumerate(POSE_OF_HAND):
+        pose_mask[:, fingers] &= ~seen_hand[:, side, None]
+        pose_mask[:, wrist] &= ~hand_mask[:, side, 0]  # a hand at the edge may lack its own wrist
     return pose_mask, hand_mask, visible(mesh, threshold, sizes) & seen_face[:, None]
 
 

@@ -11,7 +11,6 @@ import torch
 from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
 from stages.fit import terms
 from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix
-from stages.fit.hands import trusted_hands
 from stages.fit.initialise import continuous, torso_orientation
 from stages.fit.observations import drop_guesses, observe, visible
 from stages.fit.optimise import finite_sum, rate
@@ -128,44 +127,6 @@ def test_hips_are_dropped_only_where_knees_are_unseen():
     drop_guesses(mask, (23, 24), (25, 26))
     assert not mask[:25, 23:25].any() and mask[45:, 23:25].all()
     assert mask[:, 11].all()
-
-
-def hand_track(count=9):
-    """Two open hands, 100 pixels apart, of 20 pixels' palm; wrists where the pose says."""
-    rng = np.random.default_rng(0)
-    hand = np.zeros((21, 3), np.float32)
-    for finger, angle in enumerate((-0.8, -0.3, 0.0, 0.3, 0.6)):
-        for knuckle, reach in enumerate((20, 28, 34, 39)):
-            hand[1 + 4 * finger + knuckle, :2] = reach * math.sin(angle), -reach * math.cos(angle)
-    hands = np.ones((count, 2, 21, 4), np.float32)
-    hands[..., :3] = hand + rng.normal(0, 0.1, (count, 2, 21, 3))
-    hands[:, 0, :, :2] += (200, 100)
-    hands[:, 1, :, :2] += (100, 100)
-    pose, world = np.ones((count, 33, 4), np.float32), np.ones((count, 33, 4), np.float32)
-    pose[:, 15, :2], pose[:, 16, :2] = (200, 100), (100, 100)
-    return hands, pose, world
-
-
-def test_good_hands_are_trusted():
-    assert trusted_hands(*hand_track(), 0.4).all()
-
-
-def test_bad_hands_are_not():
-    hands, pose, world = hand_track()
-    wrist = hands[1, 0, :1, :3].copy()
-    hands[1, 0, 1:, :3] = wrist + 0.2 * (hands[1, 0, 1:, :3] - wrist)  # collapsed
-    knuckles = hands[2, 0, [5, 9, 13, 17], :3].repeat(4, axis=0)
-    hands[2, 0, 5:, :3] = knuckles + 0.3 * (hands[2, 0, 5:, :3] - knuckles)  # stumps for fingers
-    hands[3, 0, :, 0] += 60  # away from the wrist
-    pose[4, 15, 3], hands[4, 0, :, 1] = 0.1, hands[4, 0, :, 1] - 200  # leaps, the wrist unseen
-    hands[8, 1, :, :2] = hands[8, 0, :, :2]  # both on the left hand
-    pose[8, 16, :2] = pose[8, 15, :2]
-    world[8, 15, 2], world[8, 16, 2] = 0.3, 0.1  # ... which is the farther
-    hands[6, 1, :, 3] = 0  # not found
-    hands[7, 1, 3, 0] = np.nan
-    trusted = trusted_hands(hands, pose, world, 0.4)
-    assert trusted[:, 0].tolist() == [True, False, False, False, False, True, True, True, False]
-    assert trusted[:, 1].tolist() == [True, True, True, True, True, True, False, False, True]
 
 
 def test_threshold_masks_points(model):
