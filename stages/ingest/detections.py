@@ -17,10 +17,11 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.keypoints import COUNT
-from pipeline.records import read_json
+from pipeline.untrusted import check_picture, parse_json
 from stages.ingest.video import PICTURES
 
 _REMEDY = "write it again as 133 [x, y, score] or as mmpose's results"
+_MOST_BYTES = 16 << 20  # mmpose writes every person of a frame
 LARGEST = 1e6  # pixels; beyond it a coordinate is no measurement
 _NUMBER = re.compile(r"(?:.*\D)?(\d+)")
 
@@ -73,7 +74,7 @@ def read_whole_body(path: Path) -> np.ndarray:
         UserError: not JSON, not 133 points, or a number that is not finite. Points with null
             coordinates are refused as well.
     """
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY, _MOST_BYTES)
     if isinstance(value, dict) and "instance_info" in value:
         return _best(path, value["instance_info"])
     return _points(path, value)
@@ -81,10 +82,11 @@ def read_whole_body(path: Path) -> np.ndarray:
 
 def read_foreign_mask(path: Path, width: int, height: int) -> np.ndarray:
     """A mask file as soft alpha [height, width] uint8, resized by averaging; UserError if damaged."""
-    data = np.fromfile(path, np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    data, remedy = np.fromfile(path, np.uint8), "replace it, or set ingest.masks=mediapipe"
+    check_picture(path, remedy, data.tobytes())
+    mask = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if mask is None:
-        raise UserError(f"{path} is not a readable picture: replace it, or set ingest.masks=mediapipe")
+        raise UserError(f"{path} is not a readable picture: {remedy}")
     if mask.ndim == 3:  # a picture with transparency carries the mask there
         mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(-1)
     if mask.dtype == np.uint16:

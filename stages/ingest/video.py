@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.untrusted import check_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _VIDEO_REMEDY = "give a video that FFmpeg can play, or a folder of pictures"
@@ -170,10 +171,11 @@ def number_files(files: list[Path]) -> dict[int, Path]:
 
 def read_picture(path: Path) -> np.ndarray:
     """A picture file, [H, W, 3] uint8 RGB, upright after its EXIF flag; UserError if it is damaged."""
-    data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    data, remedy = np.fromfile(path, np.uint8), "replace it or take it out of the folder"
+    check_picture(path, remedy, data.tobytes())
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if image is None:
-        raise UserError(f"{path} is not a readable picture: replace it or take it out of the folder")
+        raise UserError(f"{path} is not a readable picture: {remedy}")
     return np.ascontiguousarray(image[..., ::-1])
 
 
