@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import torch
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.tables import read_table, vectors, write_table
+from pipeline.untrusted import parse_json
 
 CAMERA_SCHEMA = pa.schema(
     [
@@ -167,20 +167,6 @@ def read_json(path: Path, remedy: str) -> Any:
     """Read JSON.
 
     Raises:
-        UserError: the file is missing, is not JSON, or holds NaN or an infinity.
+        UserError: as ``untrusted.parse_json``: missing, too large, no JSON, NaN or an infinity.
     """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite)
-    except FileNotFoundError:
-        raise UserError(f"{path} is missing: {remedy}") from None
-    except (ValueError, OSError, RecursionError) as error:
-        raise UserError(f"{path} is not readable JSON ({error}): {remedy}") from None
-
-
-def _refuse(name: str) -> float:
-    raise ValueError(f"it holds {name}, which is no finite number")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    return value if math.isfinite(value) else _refuse(text)
+    return parse_json(path, remedy)

@@ -14,6 +14,8 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import UserError
 
+MOST_BYTES = 4 << 30  # an hour of keypoints unpacks to half of it
+
 
 def vectors(length: int, kind: pa.DataType | None = None) -> pa.DataType:
     """The column type of ``length`` numbers a row, float32 unless ``kind`` says otherwise."""
@@ -56,13 +58,26 @@ def read_table(path: Path, schema: pa.Schema, remedy: str) -> dict[str, np.ndarr
             value is null or not finite.
     """
     try:
-        table = pq.read_table(path, columns=None)
+        table = open_table(path)
     except FileNotFoundError:
         raise UserError(f"{path} is missing: {remedy}") from None
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{path} is not a readable Parquet file ({reason}): {remedy}") from None
     return {field.name: _from_arrow(path, field, table, remedy) for field in schema}
+
+
+def open_table(path: Path) -> pa.Table:
+    """Read a whole Parquet file that does not unpack to more than ``MOST_BYTES``.
+
+    Raises:
+        OSError, pa.ArrowException: it is missing, damaged, or too large.
+    """
+    with pq.ParquetFile(path) as file:
+        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        if sum(group.total_byte_size for group in groups) > MOST_BYTES:
+            raise pa.ArrowInvalid(f"it unpacks to more than {MOST_BYTES >> 30} GB")
+        return file.read()
 
 
 def _to_arrow(name: str, field: pa.Field, array: np.ndarray) -> pa.Array:

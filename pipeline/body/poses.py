@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
 from pipeline.errors import UserError
+from pipeline.tables import open_table
 
 _JOINTS = len(JOINT_NAMES)
 
@@ -84,12 +85,12 @@ def read_poses(path: Path) -> Poses:
         UserError: the file is damaged or lacks a column.
     """
     try:
-        table = pq.read_table(path)
+        table = open_table(path)
         frames = tuple(table["frame"].to_pylist())
         rotation, expression, transl = (_rows(table, name) for name in ("rotation", "expression", "transl"))
         valid = {"valid": _truths(table, "valid")} if "valid" in table.column_names else {}
         return Poses(frames, rotation.unflatten(1, (_JOINTS, 3)), expression, transl, **valid)
-    except (OSError, KeyError, ValueError, RuntimeError, pa.ArrowInvalid) as error:
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, pa.ArrowInvalid) as error:
         raise UserError(f"{path} cannot be read as poses ({error}): run the fit stage again") from error
 
 

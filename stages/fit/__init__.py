@@ -8,7 +8,16 @@ STAGE = Stage(
     version=5,
     settings=FitSettings,
     run="stages.fit.run:run",
-    needs={"ingest": ("keypoints.parquet", "cameras.parquet", "footage.json", "frames/*", "masks/*")},
+    needs={
+        "ingest": (
+            "keypoints.parquet",
+            "cameras.parquet",
+            "footage.json",
+            "initial_poses.safetensors",
+            "frames/*",
+            "masks/*",
+        )
+    },  # fmt: skip
     reads_body=True,
     path_settings=("pose_init", "face_init", "flame_model"),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -23,12 +24,13 @@ from pipeline.body import (
 from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
+from pipeline.pose_files import read_hand_mean
 from pipeline.records import read_cameras, read_footage, write_json
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
-from stages.fit.pose_files import read_hand_mean, read_initial_poses, write_peer_files
-from stages.fit.registration import Registration, register, steps_of
+from stages.fit.pose_files import given_poses, keep_given, write_peer_files
+from stages.fit.registration import Registration, register, steps_of, views_of
 from stages.fit.residuals import group_means, write_residuals
 from stages.fit.smoothing import smooth
 
@@ -53,7 +55,8 @@ def _run(context: Context) -> None:
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
     context.log(f"reprojection: {summary or 'no keypoint was trusted in any frame'}")
     write_identity(context.output / "identity.safetensors", fitted.identity, body)
-    smoothed = smooth(fitted.poses, context.settings.smoothing_window)
+    window = 0 if context.settings.given == "keep" else context.settings.smoothing_window
+    smoothed = smooth(fitted.poses, window)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
     registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
@@ -67,19 +70,23 @@ def _run(context: Context) -> None:
 
 def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -> Registration:
     """Register the body to the clip that ingest published."""
-    settings = context.settings
+    settings, ingest = context.settings, context.inputs["ingest"]
     landmarks = load_landmarks(body, context.body)
-    keypoints = read_keypoints(context.inputs["ingest"] / "keypoints.parquet")
-    initial = None
-    if settings.pose_init:
-        frames, mean = keypoints.frames.tolist(), read_hand_mean(context.body_file)
-        initial = read_initial_poses(Path(settings.pose_init), frames, mean, context.log)
+    keypoints = read_keypoints(ingest / "keypoints.parquet")
+    frames = keypoints.frames.tolist()
+    initial = given_poses(settings, ingest, body, context.body_file, frames, context.log)
+    kept = None
+    if settings.given == "keep" and initial is not None:
+        kept = keep_given(initial, body, views_of(keypoints, cameras))
+        settings = dataclasses.replace(settings, iterations=0, face="off")
+        context.log("publishes the poses that came with the footage as they are")
     with context.progress(steps_of(settings), "registration") as progress:
 
         def report(note: str) -> None:
             progress.advance(1, note)
 
-        return register(body, landmarks, keypoints, cameras, settings, report, initial, context.log)
+        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log)
+    return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
 
 
 def write_motion(

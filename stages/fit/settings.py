@@ -6,6 +6,7 @@ import dataclasses
 
 FACE_SOURCES = ("auto", "mesh", "flame", "off")
 SOLVERS = ("adam", "lm")
+GIVEN = ("start", "keep", "ignore")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,7 @@ class FitSettings:
     face_init: str = ""  # folder of DECA's flame_params/ and shape_param.json, for face=flame
     flame_model: str = ""  # FLAME model file of the user's own, for face=flame
     pose_init: str = ""  # folder of SMPLest-X poses, smplx_init/*.json; else the estimator's landmarks
+    given: str = "start"  # poses that came with the dataset: start from them, keep them as they are, ignore
 
     # What is published
     smoothing_window: int = 5  # frames of the Savitzky-Golay filter, odd; 0 leaves the poses as fitted
@@ -49,7 +51,7 @@ class FitSettings:
             self._require(name, 0 <= getattr(self, name) < float("inf"), "be zero or more")
         for name in ("score_threshold", "overlay_opacity"):
             self._require(name, 0 <= getattr(self, name) <= 1, "lie between 0 and 1")
-        for name, words in (("face", FACE_SOURCES), ("solver", SOLVERS)):
+        for name, words in (("face", FACE_SOURCES), ("solver", SOLVERS), ("given", GIVEN)):
             self._require(name, getattr(self, name) in words, f"be one of {', '.join(words)}")
         window = self.smoothing_window
         self._require(

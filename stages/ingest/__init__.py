@@ -5,12 +5,12 @@ from stages.ingest.settings import IngestSettings
 
 STAGE = Stage(
     name="ingest",
-    version=2,
+    version=3,
     settings=IngestSettings,
     run="stages.ingest.run:run",
     assets=lambda settings: ("mediapipe",) if settings.uses_estimator else (),
     reads_source=lambda settings: not settings.mannequin,
     reads_body=lambda settings: bool(settings.mannequin),
-    path_settings=("keypoints", "masks", "cameras", "mannequin_motion"),
+    path_settings=("keypoints", "masks", "cameras", "mannequin_motion", "poses"),
     path_words=("auto", "pinhole", "sfm", "mediapipe"),
 )

@@ -135,7 +135,11 @@ class Looker:
         size = (self.width, self.height)
         if self.sources.masks is not None:
             file = self.sources.masks.get(picture.index)
-            return (read_foreign_mask(file, *size).astype(np.float32) / 255,) if file else "no mask file"
+            return (
+                (read_foreign_mask(file, *size, self.sources.mask_kind).astype(np.float32) / 255,)
+                if file
+                else "no mask file"
+            )
         if estimate is None:
             return "no person found"
         both = (estimate.body_mask, estimate.selfie_mask)

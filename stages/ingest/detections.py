@@ -17,10 +17,12 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.keypoints import COUNT
-from pipeline.records import read_json
+from pipeline.untrusted import check_picture, parse_json
 from stages.ingest.video import PICTURES
 
 _REMEDY = "write it again as 133 [x, y, score] or as mmpose's results"
+MASK_KINDS = ("white", "inverted", "nonzero")
+_MOST_BYTES = 16 << 20  # mmpose writes every person of a frame
 LARGEST = 1e6  # pixels; beyond it a coordinate is no measurement
 _NUMBER = re.compile(r"(?:.*\D)?(\d+)")
 
@@ -73,22 +75,40 @@ def read_whole_body(path: Path) -> np.ndarray:
         UserError: not JSON, not 133 points, or a number that is not finite. Points with null
             coordinates are refused as well.
     """
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY, _MOST_BYTES)
     if isinstance(value, dict) and "instance_info" in value:
         return _best(path, value["instance_info"])
     return _points(path, value)
 
 
-def read_foreign_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """A mask file as soft alpha [height, width] uint8, resized by averaging; UserError if damaged."""
-    data = np.fromfile(path, np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+def read_foreign_mask(path: Path, width: int, height: int, kind: str = "white") -> np.ndarray:
+    """A mask file as soft alpha, resized by averaging.
+
+    Args:
+        path: a grey picture, or one with transparency, which then is the mask.
+        width, height: of the result, pixels.
+        kind: one of ``MASK_KINDS``, what in it is the person: ``white`` (255 is wholly so), ``inverted``
+            (0 is) or ``nonzero`` (anything but 0 is).
+
+    Returns:
+        [height, width] uint8, 255 where the pixel is wholly the person's.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    data, remedy = np.fromfile(path, np.uint8), "replace it, or set ingest.masks=mediapipe"
+    check_picture(path, remedy, data.tobytes())
+    mask = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if mask is None:
-        raise UserError(f"{path} is not a readable picture: replace it, or set ingest.masks=mediapipe")
+        raise UserError(f"{path} is not a readable picture: {remedy}")
     if mask.ndim == 3:  # a picture with transparency carries the mask there
         mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(-1)
     if mask.dtype == np.uint16:
         mask = mask // 257
+    if kind == "nonzero":
+        mask = (mask > 0).astype(np.uint8) * 255
+    elif kind == "inverted":
+        mask = 255 - mask
     resized = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     return np.clip(np.round(resized), 0, 255).astype(np.uint8)
 

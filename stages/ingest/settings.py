@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from stages.ingest.layouts import LAYOUTS
 from stages.ingest.mannequin.spec import spec_of
 
 
@@ -14,13 +15,18 @@ class IngestSettings:
     long_side: int = 512  # pixels; larger footage is stored at this size, smaller footage as it is
     stride: int = 1  # every stride-th frame is looked at
     max_frames: int = 0  # how many frames are looked at, 0 for all
-    keypoints: str = "mediapipe"  # or a folder of mmpose/DWPose JSON, one file a frame
-    masks: str = "mediapipe"  # or a folder of grey pictures, one a frame, white where the person is
+    layout: str = "auto"  # how the source lies on disk: auto, plain, or a dataset's, see layouts.py
+    keypoints: str = "auto"  # the dataset's, else mediapipe; or a folder of mmpose/DWPose JSON, one a frame
+    masks: str = (
+        "auto"  # the dataset's, else mediapipe; or a folder of grey pictures, white where the person is
+    )
+    poses: str = ""  # file of poses to start from that lies elsewhere than the footage: SHOW's .pkl
     test_fraction: float = 0.1  # the part of the kept frames, at the clip's end, that is held out
     test_frames: int = 0  # how many of the last frames are held out, in place of test_fraction
     focal: float = 1.2  # the camera's focal length over the longer side of the picture
     cameras: str = "auto"  # pinhole, sfm, a COLMAP model, a calibration file, a folder of cam_params
     camera_name: str = ""  # which camera of a calibrated rig filmed the clip
+    test_cameras: tuple[str, ...] = ()  # further cameras of a rig that are held out; others: all the rest
     camera_scale: float = 0.0  # metres a unit of cameras without a scale; 0 finds it from the person
     estimator_long_side: int = 1920  # larger pictures are reduced to this for the estimator
     estimator_short_side: int = 400  # smaller pictures are enlarged towards this, at most three times
@@ -48,16 +54,18 @@ class IngestSettings:
             value = getattr(self, name)
             if not least <= value <= most:
                 raise ValueError(f"ingest.{name} must lie between {least} and {most}, not {value}")
-        for name, words in (("keypoints", "mediapipe"), ("masks", "mediapipe"), ("cameras", "auto")):
+        for name, words in (("keypoints", "auto"), ("masks", "auto"), ("cameras", "auto")):
             if not getattr(self, name).strip():
                 raise ValueError(f"ingest.{name} must be '{words}' or a path")
+        if self.layout not in ("auto", *LAYOUTS):
+            raise ValueError(f"ingest.layout must be auto, {', '.join(LAYOUTS)}, not {self.layout}")
         if self.mannequin:
             spec_of(self)
 
     @property
     def uses_estimator(self) -> bool:
-        """Whether MediaPipe looks at the footage."""
-        return not self.mannequin and "mediapipe" in (self.keypoints, self.masks)
+        """Whether MediaPipe may have to look at the footage."""
+        return not self.mannequin and bool({"mediapipe", "auto"} & {self.keypoints, self.masks})
 
 
 RANGES: dict[str, tuple[float, float]] = {

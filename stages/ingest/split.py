@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import UserError
 from pipeline.records import Split
+from stages.ingest.datasets import Recording
 
 
 def split_frames(frames: Sequence[int], fraction: float, last: int) -> Split:
@@ -25,3 +26,26 @@ def split_frames(frames: Sequence[int], fraction: float, last: int) -> Split:
             f"{count} frames are to be held out of {len(frames)} that hold a person: lower ingest.test_frames"
         )
     return Split(tuple(frames[: len(frames) - count]), tuple(frames[len(frames) - count :]))
+
+
+def split_recording(recording: Recording, frames: Sequence[int], fraction: float, last: int) -> Split:
+    """The dataset's own split of the kept frames, else the clip's end is held out.
+
+    Args:
+        recording: the dataset's folder.
+        frames: the kept frames, increasing.
+        fraction, last: as for ``split_frames``. ``last`` replaces the dataset's split of a single camera.
+
+    Raises:
+        UserError: nothing is left to learn from.
+    """
+    own = recording.train is not None and recording.test is not None
+    if not own or (last and len(recording.shots) == 1):
+        return split_frames(frames, fraction, last)
+    assert recording.train is not None and recording.test is not None
+    train = tuple(frame for frame in frames if frame in recording.train)
+    if not train:
+        raise UserError(
+            f"the {recording.layout} split leaves no person to learn from: set ingest.test_frames"
+        )
+    return Split(train, tuple(frame for frame in frames if frame in recording.test))

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.untrusted import check_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _VIDEO_REMEDY = "give a video that FFmpeg can play, or a folder of pictures"
@@ -28,6 +29,7 @@ class Clip:
         expected: how many frames the source says it has; 0 where it does not say.
         pictures: frame number -> file, for a folder; empty for a video.
         turns: by how many quarters, counter-clockwise, the rotation flag turns a video's frames.
+        first: the number of a video's first frame.
     """
 
     path: Path
@@ -37,6 +39,7 @@ class Clip:
     expected: int
     pictures: dict[int, Path] = dataclasses.field(default_factory=dict)
     turns: int = 0
+    first: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +133,7 @@ def _read_video(clip: Clip, stride: int) -> Iterator[Picture]:
             time = frame.time if frame.time is not None else index / (clip.fps or 1.0)
             start = time if index == 0 else start
             if index % stride == 0:
-                yield Picture(index, time - start, _upright(frame, ratio))
+                yield Picture(clip.first + index, time - start, _upright(frame, ratio))
 
 
 def _upright(frame: av.VideoFrame, ratio: Fraction | None) -> np.ndarray:
@@ -170,14 +173,17 @@ def number_files(files: list[Path]) -> dict[int, Path]:
 
 def read_picture(path: Path) -> np.ndarray:
     """A picture file, [H, W, 3] uint8 RGB, upright after its EXIF flag; UserError if it is damaged."""
-    data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    data, remedy = np.fromfile(path, np.uint8), "replace it or take it out of the folder"
+    check_picture(path, remedy, data.tobytes())
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if image is None:
-        raise UserError(f"{path} is not a readable picture: replace it or take it out of the folder")
+        raise UserError(f"{path} is not a readable picture: {remedy}")
     return np.ascontiguousarray(image[..., ::-1])
 
 
 def _read_folder(clip: Clip, stride: int) -> Iterator[Picture]:
+    begin = next(iter(clip.pictures))
     for place, (index, file) in enumerate(clip.pictures.items()):
         if place % stride == 0:
-            yield Picture(index, float(place), read_picture(file))
+            seconds = (index - begin) / clip.fps if clip.fps else float(place)
+            yield Picture(index, seconds, read_picture(file))

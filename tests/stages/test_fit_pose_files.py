@@ -22,16 +22,11 @@ from pipeline.body import (
 )
 from pipeline.camera import facing_camera, to_camera
 from pipeline.keypoints import empty_keypoints
+from pipeline.pose_files import read_hand_mean, read_initial_poses
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model
-from stages.fit.pose_files import (
-    initial_from_files,
-    is_official_smplx,
-    read_hand_mean,
-    read_initial_poses,
-    write_peer_files,
-)
+from stages.fit.pose_files import initial_from_files, is_official_smplx, write_peer_files
 from stages.fit.pose_files.export import tool_joints
 from stages.fit.registration import views_of
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
@@ -174,7 +169,7 @@ def test_the_list_holds_measured_frames_and_equal_fits_give_equal_bytes(
         write_peer_files(tmp_path / name, body, identity, poses, poses, moving, hand_mean)
     assert (tmp_path / "a" / "frame_list_all.txt").read_text() == "3\n4\n9\n"
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert len(files) == 3 * COUNT + 5
+    assert len(files) == 3 * COUNT + 6  # body.json says whose coefficients they are
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 

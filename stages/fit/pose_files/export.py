@@ -6,6 +6,7 @@
     smplx_optimized/smplx_params_smoothed/<frame>.json    poses after smoothing
     smplx_optimized/shape_param.json                      beta, 100 numbers
     smplx_optimized/{face,joint,locator}_offset.json      [V][3], [55][3], [55][3], metres
+    smplx_optimized/body.json                             the digest of the body that was fitted; ours alone
     cam_params/<frame>.json                               R [3][3], t [3], focal [2], princpt [2]
     frame_list_all.txt                                    the measured frames, one a line
 
@@ -37,7 +38,7 @@ from torch import Tensor
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
 from pipeline.body.joints import BODY_POSE, JAW, LEFT_EYE, LEFT_HAND, RIGHT_EYE, RIGHT_HAND
 from pipeline.camera import Camera
-from stages.fit.pose_files.axes import HAND_JOINTS, into_camera, moved_pivot
+from pipeline.pose_files.axes import HAND_JOINTS, into_camera, moved_pivot
 
 _BETAS, _EXPRESSIONS = 100, 50  # what the tools' models are built with
 _DIGITS = 7  # decimals: a tenth of a micrometre, a hundred-thousandth of a degree
@@ -83,6 +84,7 @@ def write_peer_files(
     _write(fitted / "face_offset.json", _numbers(identity.face_offset))
     _write(fitted / "joint_offset.json", _numbers(joint_offset))
     _write(fitted / "locator_offset.json", _numbers(torch.zeros_like(joint_offset)))
+    _write(fitted / "body.json", {"body": body.digest})
     _write_cameras(folder / "cam_params", raw.frames, views)
     measured = [f"{frame}\n" for frame, valid in zip(raw.frames, raw.valid.tolist(), strict=True) if valid]
     (folder / "frame_list_all.txt").write_text("".join(measured), encoding="ascii", newline="\n")

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel
+from pipeline.pose_files.axes import into_world
+from pipeline.pose_files.read import InitialPoses
 from stages.fit.facing import pose_facing
 from stages.fit.initialise import weak_perspective
 from stages.fit.observations import Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
-from stages.fit.pose_files.axes import into_world
-from stages.fit.pose_files.read import InitialPoses
 from stages.fit.views import Views
 
 _VERTICES, _TRIANGLES = 10_475, 20_908  # of every release of SMPL-X
@@ -34,6 +34,13 @@ def is_official_smplx(body: BodyModel) -> bool:
     return len(body.v_template) == _VERTICES and len(body.faces) == _TRIANGLES and min(counts) >= 10
 
 
+def knows_coefficients(start: InitialPoses, body: BodyModel) -> bool:
+    """Whether the shape and the expression that came with poses mean to this body what they meant there."""
+    if start.model == "smplx":
+        return is_official_smplx(body)
+    return start.model == body.digest
+
+
 def initial_facing(start: InitialPoses, body: BodyModel, views: Views) -> np.ndarray:
     """Whether the estimated heads look at the camera, see ``facing.pose_facing``: [T]."""
     nowhere = torch.zeros(len(start.frames), 3)
@@ -49,6 +56,7 @@ def initial_from_files(
     model: LandmarkModel,
     views: Views,
     log: Callable[[str], None] = lambda note: None,
+    believe: bool = False,
 ) -> Parameters:
     """The start of the optimisation for T frames, from pose files.
 
@@ -63,6 +71,7 @@ def initial_from_files(
         model: the landmarks.
         views: the cameras.
         log: told in one line each what of the files was not used.
+        believe: take the files' place also where the landmarks know a better one.
 
     Raises:
         ValueError: ``start`` is of other frames.
@@ -71,7 +80,7 @@ def initial_from_files(
         raise ValueError("the initial poses are not of the observed frames")
     sizes = model.shape.shape[2], model.expression.shape[2], model.face.shape[1]
     nowhere = torch.zeros(len(start.frames), 3)
-    shared = _coefficients(start, is_official_smplx(body), sizes, log)
+    shared = _coefficients(start, body, sizes, log)
     pivot = model.joints[0] + model.joint_shape[0] @ shared["betas"]
     trans = nowhere if start.transl is None else start.transl
     orient, placed = into_world(start.rotation[:, 0], trans, pivot, views.rotation, views.translation)
@@ -81,8 +90,10 @@ def initial_from_files(
     transl = weak_perspective(points, observations, views)
     if start.transl is not None:
         given = placed.to(transl)
+        if start.pivot is not None:
+            given = given + start.pivot.to(given) - pivot
         errors = [_error(points, place, observations, views) for place in (given, transl)]
-        if errors[0] <= errors[1]:
+        if believe or errors[0] <= errors[1]:
             transl = given
         else:
             log("the pose files' translations are not used: they do not agree with the clip's cameras")
@@ -90,18 +101,19 @@ def initial_from_files(
 
 
 def _coefficients(
-    start: InitialPoses, official: bool, sizes: tuple[int, int, int], log: Callable[[str], None]
+    start: InitialPoses, body: BodyModel, sizes: tuple[int, int, int], log: Callable[[str], None]
 ) -> dict[str, Tensor]:
     """Betas [B] and expression [T, E]: the files' where they mean something to the body, else zero."""
     shared = {"betas": torch.zeros(sizes[0]), "expression": torch.zeros(len(start.frames), sizes[1])}
     found = {"betas": start.betas, "expression": start.expression}
-    if official:
+    if knows_coefficients(start, body):
         for name, values in found.items():
             if values is not None:
                 count = min(values.shape[-1], shared[name].shape[-1])
                 shared[name][..., :count] = values[..., :count]
     elif any(values is not None for values in found.values()):
-        log("shape and expression of the pose files are not used: they are SMPL-X's, the body is not")
+        whose = {"smplx": "SMPL-X's", "smpl": "SMPL's"}.get(start.model, "another's")
+        log(f"shape and expression of the pose files are not used: they are {whose}, the body is not")
     return shared
 
 

@@ -14,13 +14,14 @@ import torch
 from pipeline.camera import Camera, facing_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
+from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.apply import select
 from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, pinhole_lens
 from stages.ingest.cameras.gaps import fill_gaps
 from stages.ingest.cameras.lens import LEFT_ALONE, distortion, pinhole_of, stored_view
 from stages.ingest.cameras.motion import measure_motion
 from stages.ingest.cameras.numbering import frames_by_name
-from stages.ingest.cameras.scale import Scale, metric_scale, person_places
+from stages.ingest.cameras.scale import Scale, metric_scale, person_places, posed_places
 from stages.ingest.cameras.structure import mapped_frames, structure_from_motion
 from stages.ingest.cameras.turning import MOSTLY_TURNS, ONLY_TURNS, chain_turns, unexplained_by_turns
 from stages.ingest.cameras.world import settle
@@ -48,14 +49,21 @@ class Chosen:
     record: Mapping[str, Any]
 
 
-def choose_cameras(context: Context, clip: Clip, detected: Detected, given: Calibration | None) -> Chosen:
+def choose_cameras(
+    context: Context,
+    clip: Clip,
+    detected: Detected,
+    given: Calibration | None,
+    poses: InitialPoses | None = None,
+) -> Chosen:
     """The cameras of the kept frames.
 
     Args:
         context: the stage's; ``frames`` and ``masks`` are written by now.
         clip: the footage.
         detected: what was seen in it.
-        given: the user's calibration, if there is one.
+        given: the user's or the dataset's calibration, if there is one.
+        poses: what the dataset says of the body, which then tells the scale.
 
     Raises:
         UserError: the calibration is not of this footage.
@@ -63,7 +71,7 @@ def choose_cameras(context: Context, clip: Clip, detected: Detected, given: Cali
     settings = context.settings
     frames = [int(frame) for frame in detected.keypoints.frames]
     if given is not None:
-        return _from_calibration(context, clip, detected, given)
+        return _from_calibration(context, clip, detected, given, poses)
     record: dict[str, Any] = {"source": "pinhole", "displacement": None, "metres_per_unit": None}
     if settings.cameras == "auto":
         motion = measure_motion(context.output, frames, kept_rate(context, clip))
@@ -136,8 +144,10 @@ def _from_model(
     return Chosen(_cameras(_settled(scaled)), {}, record)
 
 
-def _from_calibration(context: Context, clip: Clip, detected: Detected, given: Calibration) -> Chosen:
-    """The cameras that the user gives."""
+def _from_calibration(
+    context: Context, clip: Clip, detected: Detected, given: Calibration, poses: InitialPoses | None
+) -> Chosen:
+    """The cameras that the user or the dataset gives."""
     frames = [int(frame) for frame in detected.keypoints.frames]
     stored = {
         name: stored_view(view, clip, detected.width, detected.height, given.path)
@@ -157,7 +167,8 @@ def _from_calibration(context: Context, clip: Clip, detected: Detected, given: C
         )
     scale = Scale(1.0, "metres as given")
     if not given.metric:
-        views, scale = _metric(context, detected.keypoints, views, kept_rate(context, clip), given)
+        rate = kept_rate(context, clip)
+        views, scale = _metric(context, detected.keypoints, views, rate, given, poses)
     bent = {number: distortion(lens) for number, lens in {id(v.lens): v.lens for v in views.values()}.items()}
     lenses = {f: v.lens for f, v in views.items() if bent[id(v.lens)] > LEFT_ALONE}
     context.log(
@@ -184,7 +195,12 @@ def _distorted(pixels: float, taken_out: bool) -> str:
 
 
 def _metric(
-    context: Context, keypoints: Keypoints, views: Mapping[int, View], fps: float, model: Calibration
+    context: Context,
+    keypoints: Keypoints,
+    views: Mapping[int, View],
+    fps: float,
+    model: Calibration,
+    poses: InitialPoses | None = None,
 ) -> tuple[dict[int, View], Scale]:
     """The views with translations in metres."""
     scale = Scale(context.settings.camera_scale, f"{context.settings.camera_scale:g} metres a unit, as set")
@@ -194,7 +210,9 @@ def _metric(
         lenses = [view.lens for view in chosen]
         focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
         centre = np.array([[lens.principal_point_x, lens.principal_point_y] for lens in lenses])
-        placed, places = person_places(select(keypoints, rows), focal, centre)
+        placed, places = posed_places(keypoints.frames[rows], poses)
+        if not len(placed):
+            placed, places = person_places(select(keypoints, rows), focal, centre)
         rotations, translations = (
             np.stack([getattr(v, n) for v in chosen]) for n in ("rotation", "translation")
         )

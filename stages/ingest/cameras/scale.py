@@ -17,12 +17,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.keypoints import Keypoints
+from pipeline.pose_files import InitialPoses
 
 TRUNK, HEAD = (11, 12, 23, 24), tuple(range(11))  # of MediaPipe's pose; the trunk turns, but hardly bends
 VISIBLE = 0.5
 MOSTLY = 0.7  # part of the frames in which a point must be seen to be used
 SMOOTH_SECONDS = 0.2  # deviation of the filter
 NEAREST, FARTHEST = 0.7, 30.0  # median depth of the scene over the person's
+_PIVOT = (0.0, -0.35, 0.0)  # the root joint of a body at rest, where poses do not say whose it is
 STILL = 1e-9  # squared motion of the cameras, in their unit, below which there is nothing to scale
 
 
@@ -71,6 +73,24 @@ def person_places(
     rows, depth = rows[usable], 1 / inverse[usable]
     offset = (there.mean(1)[usable] - centre[rows]) / focal[rows] * depth[:, None]
     return rows, np.concatenate([offset, depth[:, None]], axis=1)
+
+
+def posed_places(frames: np.ndarray, poses: InitialPoses | None) -> tuple[np.ndarray, np.ndarray]:
+    """Where poses that came with a dataset put the root joint in each camera's axes.
+
+    Args:
+        frames: [T], frame numbers.
+        poses: of some frames, or None.
+
+    Returns:
+        As ``person_places``; nothing where there are no poses, or they have no place.
+    """
+    if poses is None or poses.transl is None:
+        return np.zeros(0, int), np.zeros((0, 3))
+    pivot = np.array(_PIVOT) if poses.pivot is None else poses.pivot.double().numpy()
+    at = dict(zip(poses.frames, poses.transl.double().numpy() + pivot, strict=True))
+    rows = [row for row, frame in enumerate(frames.tolist()) if frame in at]
+    return np.array(rows, int), np.array([at[int(frames[row])] for row in rows]).reshape(-1, 3)
 
 
 def metric_scale(

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
-from stages.fit.pose_files.axes import HAND_JOINTS
+from pipeline.pose_files.axes import HAND_JOINTS
 
 _ROTATIONS = {  # name -> numbers, in the order of the schema's joints
     "root_pose": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3,
@@ -43,6 +43,15 @@ class InitialPoses:
         betas: [B], likewise, the median over the clip, or None.
         transl: [T, 3], the files' ``trans``, metres in the camera's axes, or None.
         valid: [T] bool, whether the frame had a usable file. The others are interpolated.
+        pivot: [3], the root joint at rest of the body that the poses were made with, metres, which
+            ``transl`` is relative to; None means that of the body which is posed by them.
+        hands: what the hands are relative to: ``flat`` hands, or the ``mean`` of the body's file.
+        hand_pca: [T, 2, P], left then right, coefficients of the components of SMPL-X's hands, which add
+            to ``rotation``; or None.
+        model: whose coefficients ``betas`` and ``expression`` are: ``smplx``, ``smpl``, or a body's
+            digest.
+        fitted: whether they were fitted to the clip, and not estimated frame by frame.
+        joint_offset, face_offset: [55, 3] and [V, 3], metres, of a fitted identity, or None.
     """
 
     frames: tuple[int, ...]
@@ -51,6 +60,13 @@ class InitialPoses:
     betas: Tensor | None
     transl: Tensor | None
     valid: Tensor
+    pivot: Tensor | None = None
+    hands: str = "flat"
+    hand_pca: Tensor | None = None
+    model: str = "smplx"
+    fitted: bool = False
+    joint_offset: Tensor | None = None
+    face_offset: Tensor | None = None
 
 
 def read_initial_poses(
@@ -73,29 +89,80 @@ def read_initial_poses(
     Raises:
         UserError: no frame has a usable file, or a file is malformed.
     """
+    known = read_known_poses(folder, frames)
+    if len(known.frames) < len(frames):
+        missing = len(frames) - len(known.frames)
+        log(f"{folder}: no usable pose of {missing} of {len(frames)} frames, interpolated")
+    rotation = known.rotation.clone()
+    rotation[:, HAND_JOINTS] += hand_mean.to(rotation)
+    return on_frames(dataclasses.replace(known, rotation=rotation, hands="flat"), frames)
+
+
+def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> InitialPoses:
+    """Read the poses that a folder has, with hands relative to the model's mean.
+
+    Args:
+        folder: holds ``<frame>.json``; leading zeros are allowed, other names are left alone.
+        frames: the frame numbers that are wanted; all by default.
+
+    Returns:
+        Poses of the frames whose file is usable, float64.
+
+    Raises:
+        UserError: as ``read_initial_poses``.
+    """
     paths = _by_frame(folder)
-    read = {frame: _read_frame(paths[frame]) for frame in frames if frame in paths}
+    wanted = list(paths) if frames is None else list(frames)
+    read = {frame: _read_frame(paths[frame]) for frame in wanted if frame in paths}
     usable = {frame: values for frame, values in read.items() if values is not None}
     if not usable:
-        found = f"has poses of {len(read)} of the clip's {len(frames)} frames, none usable"
+        found = f"has poses of {len(read)} of the clip's {len(wanted)} frames, none usable"
         raise UserError(f"{folder} {found}: {_REMEDY}")
-    valid = np.array([frame in usable for frame in frames])
-    if not valid.all():
-        log(f"{folder}: no usable pose of {(~valid).sum()} of {len(frames)} frames, interpolated")
-    times = torch.tensor(list(frames), dtype=torch.float64)
-    known = torch.from_numpy(valid)
-
-    rotation = _rotations(usable)
-    rotation[:, HAND_JOINTS] += hand_mean.double()
+    usable = dict(sorted(usable.items()))
     expression, transl, shape = (_vectors(name, usable, paths) for name in ("expr", "trans", "shape"))
     return InitialPoses(
-        frames=tuple(frames),
-        rotation=_turned_between(rotation, times, known).float(),
-        expression=None if expression is None else _between(expression, times, known).float(),
-        betas=None if shape is None else shape.median(dim=0).values.float(),
-        transl=None if transl is None else _between(transl, times, known).float(),
-        valid=known,
+        frames=tuple(usable),
+        rotation=_rotations(usable),
+        expression=expression,
+        betas=None if shape is None else shape.median(dim=0).values,
+        transl=transl,
+        valid=torch.ones(len(usable), dtype=torch.bool),
+        hands="mean",
     )
+
+
+def on_frames(poses: InitialPoses, frames: Sequence[int]) -> InitialPoses:
+    """The poses of other frames, float32: those that are not known come from their neighbours.
+
+    Args:
+        poses: of at least one frame.
+        frames: the T frame numbers, increasing.
+    """
+    rows = {frame: row for row, frame in enumerate(poses.frames) if bool(poses.valid[row])}
+    known = torch.tensor([frame in rows for frame in frames])
+    if not known.any():
+        nearest = min(rows, key=lambda frame: abs(frame - frames[0]))
+        chosen = torch.tensor([rows[nearest]] * len(frames))
+        filled = _each(poses, lambda values: values[chosen], lambda values: values[chosen])
+    else:
+        chosen = torch.tensor([rows[frame] for frame in frames if frame in rows])
+        times = torch.tensor(list(frames), dtype=torch.float64)
+        filled = _each(
+            poses,
+            lambda values: _turned_between(values[chosen], times, known),
+            lambda values: _between(values[chosen].flatten(1), times, known).unflatten(1, values.shape[1:]),
+        )
+    betas = None if poses.betas is None else poses.betas.float()
+    return dataclasses.replace(poses, **filled, frames=tuple(frames), valid=known, betas=betas)
+
+
+def _each(
+    poses: InitialPoses, turned: Callable[[Tensor], Tensor], moved: Callable[[Tensor], Tensor]
+) -> dict[str, Any]:
+    """What every frame has, after one function for rotations and one for the rest."""
+    vectors = {name: getattr(poses, name) for name in ("expression", "transl", "hand_pca")}
+    found = {name: None if one is None else moved(one.double()).float() for name, one in vectors.items()}
+    return {"rotation": turned(poses.rotation.double()).float(), **found}
 
 
 def read_hand_mean(body_file: Path) -> Tensor:
@@ -139,6 +206,7 @@ def _read_frame(path: Path) -> dict[str, np.ndarray] | None:
     try:
         if path.stat().st_size > _MEGABYTE:
             raise ValueError("it is larger than 1 MB")
+        # Here alone NaN is no damage: some estimators write it where they found nobody.
         value = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite)
         if not isinstance(value, dict):
             raise ValueError("it is no JSON object")

@@ -1,0 +1,57 @@
+"""Names that a file gives, and how much of a file is read."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import UserError
+
+GIGABYTE = 1 << 30
+_SHOWN = 60  # characters of a name in a message
+
+
+def inside(folder: Path, name: str, origin: Path) -> Path:
+    """The file that ``name`` means, which must lie inside ``folder``.
+
+    Links are followed before it is checked; backslashes count as slashes.
+
+    Args:
+        folder: where the file's names are relative to.
+        name: as a frame list, an archive or an index has it.
+        origin: the file that names it, for the message.
+
+    Raises:
+        UserError: the name is absolute, or leads out of the folder.
+    """
+    relative = PurePosixPath(str(name).replace("\\", "/"))
+    shown = str(name)[:_SHOWN]
+    remedy = "it may be made to harm: take it from its authors again"
+    if "\0" in str(name) or relative.is_absolute() or ".." in relative.parts or ":" in relative.parts[0:1]:
+        raise UserError(f"{origin} names '{shown}', which is outside of {folder}: {remedy}")
+    path = folder / relative
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{origin} names '{shown}', a link out of {folder}: {remedy}")
+    return path
+
+
+def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
+    """A file's content.
+
+    Args:
+        path: the file.
+        most: bytes; a larger file is refused before it is read.
+        remedy: what the user can do; it ends the error's line.
+
+    Raises:
+        UserError: the file is missing, cannot be read, or is too large.
+    """
+    try:
+        size = path.stat().st_size
+        if size > most:
+            raise UserError(f"{path} has {size >> 20} MB, more than the {most >> 20} MB allowed: {remedy}")
+        with path.open("rb") as file:
+            return file.read(most)
+    except FileNotFoundError:
+        raise UserError(f"{path} is missing: {remedy}") from None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}): {remedy}") from None

@@ -1,0 +1,179 @@
+"""INSTA: heads, with FLAME tracked by the metrical tracker; also as RGBAvatar and FATE keep it.
+
+::
+
+    images/00012.png                  RGBA; the alpha is the person
+    alpha/00012.png                   where FATE's: taken in its place
+    transforms{,_train,_test}.json    frames [{file_path, transform_matrix, ...}]; cx cy fl_x fl_y w h
+    checkpoint/00012.frame            torch file: flame {exp, jaw, eyes, ...}, opencv {R, t, K}, img_size
+
+Source: peers.md B. transform_matrix is camera-to-world with OpenGL's axes (x right, y up, z towards the
+viewer), as instant-ngp takes it: columns 1 and 2 change sign to become OpenCV's, and the inverse is
+world-to-camera. The world is the head's own, in metres, so each frame has a camera of its own. Where there is
+no transforms.json, the camera of the .frame files stands still and opencv R, t is the head in it.
+
+FLAME's numbers start the fit: expression (FLAME's first coefficients are what SMPL-X's expressions are built
+from), and the rotations of jaw and eyes, rotation vectors or the first two ROWS of a matrix (pytorch3d's six
+numbers), left eye first. The body is given the head's direction; its place is left to the keypoints, since
+FLAME's origin is no joint of SMPL-X.
+
+With transforms_train.json and transforms_test.json the split is theirs; ``ingest.test_frames=350`` is that of
+the paper and of RGBAvatar.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import UserError
+from pipeline.pose_files import InitialPoses
+from pipeline.untrusted import check_picture, inside, parse_json, read_torch
+from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
+from stages.ingest.settings import IngestSettings
+from stages.ingest.video import Clip
+
+_REMEDY = "unpack the INSTA subject again"
+_FLIP = np.diag([1.0, -1.0, -1.0])
+_FRAME_BYTES = 64 << 20
+
+
+def recognises(folder: Path) -> bool:
+    """Images with a tracker's files."""
+    tracked = (folder / "transforms.json").is_file() or (folder / "checkpoint").is_dir()
+    return (folder / "images").is_dir() and tracked
+
+
+def read(source: Path, settings: IngestSettings) -> Recording:
+    """Read an actor's folder; UserError where a file of it is malformed."""
+    pictures = numbered(source / "images")
+    clip = folder_clip(source / "images", pictures, 25.0)
+    tracked = only(numbered(source / "checkpoint", (".frame",)), pictures) or {}
+    heads = {frame: _head(path) for frame, path in tracked.items()}
+    path = source / "transforms.json"
+    if path.is_file():
+        views = _views(source, parse_json(path, _REMEDY), path, clip)
+        calibration = Calibration(path, "INSTA", views, metric=True, upright=False)
+    elif heads:
+        lens = _lens(next(iter(heads.values()))["K"], clip, source / "checkpoint")
+        still = View(lens, np.eye(3), np.zeros(3))
+        calibration = Calibration(path, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
+    else:
+        raise UserError(f"{source} has neither transforms.json nor checkpoint/*.frame: {_REMEDY}")
+    masks = only(numbered(source / "alpha"), pictures) or (pictures if _has_alpha(pictures) else None)
+    shot = Shot(clip, calibration, None, masks, "white", _poses(heads))
+    return Recording("insta", (shot,), _listed(source, "train"), _listed(source, "test"))
+
+
+def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, View]:
+    """Frame number -> camera."""
+    views = {}
+    for number, frame in _entries(source, table, path).items():
+        where = f"{path}, frame {number}"
+        matrix = numbers(entry(frame, "transform_matrix", path, _REMEDY), (4, 4), where, _REMEDY)
+        rotation = (matrix[:3, :3] @ _FLIP).T
+        check_rotation(rotation, where)
+        own = {**table, **frame}
+        size = [float(own.get(name, side)) for name, side in (("w", clip.width), ("h", clip.height))]
+        focal = [numbers(entry(own, key, path, _REMEDY), (), where, _REMEDY) for key in ("fl_x", "fl_y")]
+        centre = [
+            numbers(own.get(k, s / 2), (), where, _REMEDY) for k, s in zip(("cx", "cy"), size, strict=True)
+        ]
+        scale = [clip.width / size[0], clip.height / size[1]] if min(size) > 0 else [1.0, 1.0]
+        if min(focal) <= 0:
+            raise UserError(f"{where}: the focal length is not positive: {_REMEDY}")
+        params = [(float(f * s), float(c * s)) for f, c, s in zip(focal, centre, scale, strict=True)]
+        lens = pinhole_lens(
+            clip.width, clip.height, (params[0][0], params[1][0]), (params[0][1], params[1][1])
+        )
+        views[str(number)] = View(lens, rotation, -rotation @ matrix[:3, 3])
+    return views
+
+
+def _entries(source: Path, table: Any, path: Path) -> dict[int, dict[str, Any]]:
+    """Frame number -> its entry; each picture must lie inside the folder."""
+    frames = entry(table, "frames", path, _REMEDY)
+    if not isinstance(frames, list):
+        raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
+    found = {}
+    for frame in frames:
+        name = entry(frame, "file_path", path, _REMEDY)
+        picture = inside(source, str(name), path)
+        digits = "".join(c if c.isdigit() else " " for c in picture.stem).split()
+        if not digits:
+            raise UserError(f"{path} names '{str(name)[:60]}', which has no frame number: {_REMEDY}")
+        found[int(digits[-1])] = frame
+    return found
+
+
+def _listed(source: Path, part: str) -> frozenset[int] | None:
+    path = source / f"transforms_{part}.json"
+    return frozenset(_entries(source, parse_json(path, _REMEDY), path)) if path.is_file() else None
+
+
+def _has_alpha(pictures: dict[int, Path]) -> bool:
+    from PIL import Image
+
+    first = next(iter(pictures.values()))
+    check_picture(first, _REMEDY)
+    with Image.open(first) as picture:
+        return picture.mode in ("RGBA", "LA")
+
+
+def _head(path: Path) -> dict[str, np.ndarray]:
+    """Jaw and eyes as rotation vectors [3, 3], expression, and the head in the camera."""
+    value = read_torch(path, _REMEDY, _FRAME_BYTES)
+    flame, camera = entry(value, "flame", path, _REMEDY), entry(value, "opencv", path, _REMEDY)
+    found = {
+        key: numbers(entry(camera, key, path, _REMEDY), shape, f"{path}, opencv {key}", _REMEDY)
+        for key, shape in (("R", (3, 3)), ("t", (3,)), ("K", (3, 3)))
+    }
+    check_rotation(found["R"], str(path))
+    found["exp"] = numbers(entry(flame, "exp", path, _REMEDY), (-1,), f"{path}, exp", _REMEDY)
+    turns = [_rotation_vectors(flame, key, count, path) for key, count in (("jaw", 1), ("eyes", 2))]
+    return {**found, "turns": np.concatenate(turns)}
+
+
+def _rotation_vectors(flame: Any, key: str, count: int, path: Path) -> np.ndarray:
+    """[count, 3]; zero where the file says nothing."""
+    if key not in flame:
+        return np.zeros((count, 3))
+    flat = numbers(flame[key], (-1,), f"{path}, {key}", _REMEDY)
+    if len(flat) == 3 * count:
+        return flat.reshape(count, 3)
+    rows = numbers(flat, (count, 2, 3), f"{path}, {key}", _REMEDY)
+    first = rows[:, 0] / np.maximum(np.linalg.norm(rows[:, 0], axis=1, keepdims=True), 1e-9)
+    second = rows[:, 1] - (rows[:, 1] * first).sum(1, keepdims=True) * first
+    second = second / np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-9)
+    third = np.cross(first, second)
+    return Rotation.from_matrix(np.stack([first, second, third], axis=1)).as_rotvec()
+
+
+def _poses(heads: dict[int, dict[str, np.ndarray]]) -> InitialPoses | None:
+    if not heads:
+        return None
+    rotation = np.zeros((len(heads), 55, 3))
+    rotation[:, 0] = Rotation.from_matrix(np.stack([one["R"] for one in heads.values()])).as_rotvec()
+    rotation[:, 22:25] = np.stack([one["turns"] for one in heads.values()])
+    width = min(len(one["exp"]) for one in heads.values())
+    return InitialPoses(
+        frames=tuple(heads),
+        rotation=torch.from_numpy(rotation),
+        expression=torch.from_numpy(np.stack([one["exp"][:width] for one in heads.values()])),
+        betas=None,
+        transl=None,
+        valid=torch.ones(len(heads), dtype=torch.bool),
+        hands="mean",
+    )
+
+
+def _lens(matrix: np.ndarray, clip: Clip, path: Path) -> pycolmap.Camera:
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise UserError(f"{path}: the focal length is not positive: {_REMEDY}")
+    return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))

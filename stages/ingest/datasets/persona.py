@@ -1,0 +1,74 @@
+"""PERSONA: a captured clip, generated ones and a test clip of one person.
+
+::
+
+    captured/, test/, generated_0/, generated_1/    each: images/, masks/, cam_params/,
+                                                    keypoints_whole_body/, smplx_optimized/smplx_params/,
+                                                    frame_idx_list.txt
+
+The source is ``data/subjects/<name>``. Source: peers.md B (PERSONA ingest). The captured clip is learnt
+from and the test clip is held out; without one the captured clip's end is. Generated clips are another
+motion's poses painted with this person: they are no footage and are left for the auxiliary views. Names and
+conventions are those of ``prepared``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.errors import UserError
+from pipeline.untrusted import read_numbers
+from stages.ingest.cameras.calibration import Calibration, open_calibration
+from stages.ingest.datasets.fitted import prepared_poses
+from stages.ingest.datasets.recording import STEP, Recording, Shot, folder_clip, numbered, shifted
+from stages.ingest.settings import IngestSettings
+
+_REMEDY = "prepare the PERSONA subject again"
+
+
+def recognises(folder: Path) -> bool:
+    """A captured clip."""
+    return (folder / "captured" / "images").is_dir()
+
+
+def read(source: Path, settings: IngestSettings) -> Recording:
+    """Read a subject's folder; UserError where a file of it is malformed."""
+    if not (source / "captured").is_dir():
+        raise UserError(f"{source} has no captured/: {_REMEDY}")
+    shots = [_shot(source / "captured", 0)]
+    generated = sorted(path.name for path in source.glob("generated_*"))
+    notes = (f"{', '.join(generated)} are not footage and are left out",) if generated else ()
+    if not (source / "test" / "images").is_dir():
+        return Recording("persona", tuple(shots), notes=notes)
+    shots.append(_shot(source / "test", STEP))
+    parts = [frozenset(shot.clip.pictures) for shot in shots]
+    return Recording("persona", tuple(shots), parts[0], parts[1], notes)
+
+
+def _shot(folder: Path, first: int) -> Shot:
+    """One clip, numbered from ``first``."""
+    pictures = numbered(folder / "images")
+    listed = folder / "frame_idx_list.txt"
+    if listed.is_file():
+        wanted = frozenset(read_numbers(listed, _REMEDY))
+        pictures = {frame: file for frame, file in pictures.items() if frame in wanted}
+    new = {frame: first + frame for frame in pictures}
+    clip = folder_clip(folder / "images", {new[frame]: file for frame, file in pictures.items()}, 30.0)
+
+    def of(files: dict[int, Path]) -> dict[int, Path] | None:
+        return {new[frame]: file for frame, file in files.items() if frame in new} or None
+
+    calibration: Calibration | None = None
+    if (folder / "cam_params").is_dir():
+        given = open_calibration(str(folder / "cam_params"), "", clip)
+        assert given is not None  # a path gives one
+        views = {str(new[int(n)]): v for n, v in given.views.items() if n.isdigit() and int(n) in new}
+        calibration = Calibration(given.path, given.kind, views, given.metric, given.upright)
+    poses = shifted(prepared_poses(folder, smoothed=False), new)
+    return Shot(
+        clip,
+        calibration,
+        of(numbered(folder / "keypoints_whole_body", (".json",))),
+        of(numbered(folder / "masks")),
+        poses=poses,
+    )

@@ -1,0 +1,46 @@
+"""Which layouts there are, and which one a folder has."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+from pipeline.errors import UserError
+from pipeline.settings import near
+from stages.ingest.datasets.recording import Recording
+from stages.ingest.layouts import LAYOUTS
+from stages.ingest.settings import IngestSettings
+from stages.ingest.video import PICTURES
+
+
+def open_recording(source: Path, settings: IngestSettings) -> Recording:
+    """Read a source in the layout that the settings name, or that it has.
+
+    Raises:
+        UserError: there is nothing, the layout is not known or not found, or a file of it is malformed.
+    """
+    if not source.exists():
+        raise UserError(
+            f"{source} does not exist: give a video file, a folder of pictures or a dataset's folder"
+        )
+    name = layout_of(source) if settings.layout == "auto" else settings.layout
+    if name not in LAYOUTS:
+        known = ", ".join(LAYOUTS)
+        raise UserError(f"ingest.layout={name}: there is no such layout, only {known}{near(name, LAYOUTS)}")
+    recording: Recording = _module(name).read(source, settings)
+    if len(recording.shots) > 1 and settings.cameras != "auto":
+        raise UserError(f"ingest.cameras={settings.cameras} is for one camera; {source} is read with several")
+    return recording
+
+
+def layout_of(source: Path) -> str:
+    """The layout of a file or folder: ``plain`` for a video and for pictures that lie in it directly."""
+    if source.is_file() or any(file.suffix.lower() in PICTURES for file in source.iterdir()):
+        return "plain"
+    found = [name for name in LAYOUTS if name != "plain" and _module(name).recognises(source)]
+    return found[0] if found else "plain"
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"stages.ingest.datasets.{name}")

@@ -1,0 +1,111 @@
+"""TalkShow: a clip of somebody speaking, and what SHOW reconstructed of it.
+
+::
+
+    <seq>.mp4    the clip, cut from the broadcast, at most 10 s at 30 frames a second
+    <seq>.pkl    SHOW's reconstruction; optional
+
+The source is the folder that holds both, or the clip alone; a .pkl elsewhere is ``ingest.poses=FILE``.
+Source: peers.md B. The pickle has numbers of each frame t (numpy arrays or torch tensors): global_orient
+[T, 1, 3], body_pose_axis [T, 63], jaw_pose, leye_pose, reye_pose [T, 3], left_hand_pose and right_hand_pose
+[T, 12], expression [T, 100], transl [T, 3], betas [1, 300]; and width, height, center, focal_length,
+camera_transl [3]. Conversions: the camera is SMPLify-X's, whose axes are OpenCV's and which does not turn,
+so a point of the body is at x + camera_transl in it, and trans = transl + camera_transl. The hands are 12
+coefficients of SMPL-X's hand components, added to the model's mean (flat_hand_mean is false): without the
+user's SMPL-X file (``body=``), whose components they need, they begin relaxed, and the fit says so.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipeline.errors import UserError
+from pipeline.pose_files import InitialPoses
+from pipeline.untrusted import read_pickle
+from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, pinhole_lens
+from stages.ingest.datasets.recording import Recording, Shot, entry, numbers
+from stages.ingest.settings import IngestSettings
+from stages.ingest.video import open_clip
+
+VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+_REMEDY = "take SHOW's .pkl again, or leave it out"
+_PARTS = (  # key -> numbers a frame, the joint it begins at
+    ("global_orient", 3, 0), ("body_pose_axis", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
+    ("reye_pose", 3, 24),
+)  # fmt: skip
+
+
+def recognises(folder: Path) -> bool:
+    """One video and one pickle."""
+    return len(_files(folder, VIDEOS)) == 1 and len(_files(folder, (".pkl",))) == 1
+
+
+def read(source: Path, settings: IngestSettings) -> Recording:
+    """Read a clip, and its pickle where there is one; UserError where a file is malformed."""
+    video, pickled = source, Path(settings.poses) if settings.poses else None
+    if source.is_dir():
+        videos, found = _files(source, VIDEOS), _files(source, (".pkl",))
+        if len(videos) != 1 or len(found) > 1:
+            raise UserError(f"{source} holds {len(videos)} videos and {len(found)} .pkl: keep one clip's")
+        video, pickled = videos[0], pickled or (found[0] if found else None)
+    clip = open_clip(video)
+    if pickled is None:
+        return Recording("talkshow", (Shot(clip),))
+    table = read_pickle(pickled, _REMEDY)
+    calibration = Calibration(
+        pickled, "SHOW", {EVERY_FRAME: _view(table, pickled)}, metric=True, upright=False
+    )
+    return Recording("talkshow", (Shot(clip, calibration, poses=_poses(table, pickled)),))
+
+
+def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+
+
+def _view(table: Any, path: Path) -> View:
+    def number(key: str, shape: tuple[int, ...]) -> np.ndarray:
+        return numbers(entry(table, key, path, _REMEDY), shape, f"{path}, '{key}'", _REMEDY)
+
+    size = [int(number(key, (-1,))[0]) for key in ("width", "height")]
+    focal = number("focal_length", (-1,))
+    centre = number("center", (-1,))
+    if min(size) < 1 or max(size) > 100_000 or focal[0] <= 0 or len(centre) < 2:
+        raise UserError(f"{path}: its camera is empty: {_REMEDY}")
+    lens = pinhole_lens(*size, (focal[0], focal[-1]), (centre[0], centre[1]))
+    return View(lens, np.eye(3), np.zeros(3))
+
+
+def _poses(table: Any, path: Path) -> InitialPoses:
+    count = len(numbers(entry(table, "body_pose_axis", path, _REMEDY), (-1, 63), f"{path}", _REMEDY))
+
+    def number(key: str, width: int) -> np.ndarray:
+        value = entry(table, key, path, _REMEDY)
+        return numbers(value, (count, width), f"{path}, '{key}' of {count} frames", _REMEDY)
+
+    rotation = np.zeros((count, 55, 3))
+    for key, width, joint in _PARTS:
+        rotation[:, joint : joint + width // 3] = number(key, width).reshape(count, -1, 3)
+    hands = np.stack([number(f"{side}_hand_pose", -1) for side in ("left", "right")], axis=1)
+    shift = numbers(
+        entry(table, "camera_transl", path, _REMEDY), (-1, 3), f"{path}, 'camera_transl'", _REMEDY
+    )
+    transl = number("transl", 3) + shift
+    full = hands.shape[2] == 45
+    if full:
+        rotation[:, 25:] = hands.reshape(count, 30, 3)
+    return InitialPoses(
+        frames=tuple(range(count)),
+        rotation=torch.from_numpy(rotation),
+        expression=torch.from_numpy(number("expression", -1)),
+        betas=torch.from_numpy(
+            numbers(entry(table, "betas", path, _REMEDY), (-1,), f"{path}, 'betas'", _REMEDY)
+        ),
+        transl=torch.from_numpy(transl),
+        valid=torch.ones(count, dtype=torch.bool),
+        hands="mean",
+        hand_pca=None if full else torch.from_numpy(hands),
+    )

@@ -1,0 +1,141 @@
+"""X-Humans: a take of a scanned person, rendered.
+
+::
+
+    <id>/train/<Take>/render/image/*_000012.png
+    <id>/train/<Take>/render/cameras.npz          intrinsic [3, 3], extrinsic [T, 3, 4] or one of [3|4, 4]
+    <id>/train/<Take>/render/keypoints_whole_body/12.json
+    <id>/train/<Take>/SMPLX/*000012*.pkl
+
+The source is the take's folder. Source: peers.md A3, which names the files; ExAvatar's takes are 00028
+Take15, 00034 Take14, 00087 Take8. What is in the pickles it does not say; the names of the smplx package
+are read (global_orient, body_pose, jaw_pose, leye_pose, reye_pose, left_hand_pose, right_hand_pose,
+expression, betas, transl), and a file without them is refused. Conversions: extrinsics are world-to-camera
+with OpenCV axes, in metres; transl is relative to the root joint in the world. Hands of fewer than 45
+numbers are coefficients of SMPL-X's components, relative to the mean (see ``talkshow``).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import UserError
+from pipeline.pose_files import InitialPoses
+from pipeline.untrusted import read_npz, read_pickle
+from stages.ingest.cameras.calibration import Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
+from stages.ingest.settings import IngestSettings
+from stages.ingest.video import Clip
+
+_REMEDY = "unpack the X-Humans take again"
+_BODY = (("global_orient", 3, 0), ("body_pose", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
+         ("reye_pose", 3, 24))  # fmt: skip
+Pose = tuple[np.ndarray, np.ndarray]
+
+
+def recognises(folder: Path) -> bool:
+    """Renders with their cameras."""
+    return (folder / "render" / "cameras.npz").is_file()
+
+
+def read(source: Path, settings: IngestSettings) -> Recording:
+    """Read a take's folder; UserError where a file of it is malformed."""
+    render = source / "render"
+    clip = folder_clip(render / "image", numbered(render / "image"), 30.0)
+    path = render / "cameras.npz"
+    table = read_npz(path, _REMEDY)
+    cameras = _cameras(table, path, list(clip.pictures))
+    lens = _lens(numbers(entry(table, "intrinsic", path, _REMEDY), (3, 3), f"{path}", _REMEDY), clip)
+    views = {str(frame): View(lens, *pose) for frame, pose in cameras.items()}
+    shot = Shot(
+        clip=clip,
+        calibration=Calibration(path, "X-Humans", views, metric=True, upright=False),
+        keypoints=only(numbered(render / "keypoints_whole_body", (".json",)), clip.pictures),
+        masks=only(numbered(render / "mask"), clip.pictures),
+        poses=_poses(numbered(source / "SMPLX", (".pkl",)), cameras),
+    )
+    return Recording("xhumans", (shot,))
+
+
+def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, Pose]:
+    """Frame -> world-to-camera, by the order of the pictures."""
+    value = np.asarray(entry(table, "extrinsic", path, _REMEDY))
+    rows = value.shape[-2] if value.ndim >= 2 else 0
+    if rows not in (3, 4) or value.shape[-1] != 4:
+        raise UserError(f"{path}: 'extrinsic' is {value.shape}, not [..., 3, 4]: {_REMEDY}")
+    matrices = numbers(value, (-1, rows, 4), f"{path}, 'extrinsic'", _REMEDY)
+    if len(matrices) not in (1, len(frames)):
+        raise UserError(f"{path} has {len(matrices)} cameras for {len(frames)} pictures: {_REMEDY}")
+    found = {}
+    for row, frame in enumerate(frames):
+        matrix = matrices[min(row, len(matrices) - 1)]
+        check_rotation(matrix[:3, :3], f"{path}, camera {row}")
+        found[frame] = (matrix[:3, :3], matrix[:3, 3])
+    return found
+
+
+def _lens(matrix: np.ndarray, clip: Clip) -> pycolmap.Camera:
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise UserError(f"{clip.path}: the focal length is not positive: {_REMEDY}")
+    return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
+
+
+def _poses(files: dict[int, Path], cameras: dict[int, Pose]) -> InitialPoses | None:
+    known = {frame: file for frame, file in files.items() if frame in cameras}
+    if not known:
+        return None
+    rotation = np.zeros((len(known), 55, 3))
+    columns: dict[str, list[np.ndarray]] = {"hands": [], "expression": [], "betas": [], "transl": []}
+    for row, (frame, path) in enumerate(known.items()):
+        value = read_pickle(path, _REMEDY)
+
+        def number(key: str, count: int, value: Any = value, path: Path = path) -> np.ndarray:
+            return numbers(entry(value, key, path, _REMEDY), (count,), f"{path}, '{key}'", _REMEDY)
+
+        for key, count, joint in _BODY:
+            rotation[row, joint : joint + count // 3] = number(key, count).reshape(-1, 3)
+        turn, shift = cameras[frame]
+        root = turn @ Rotation.from_rotvec(rotation[row, 0]).as_matrix()
+        rotation[row, 0] = Rotation.from_matrix(root).as_rotvec()
+        columns["hands"].append(np.stack([number(f"{side}_hand_pose", -1) for side in ("left", "right")]))
+        columns["expression"].append(number("expression", -1))
+        columns["betas"].append(number("betas", -1))
+        columns["transl"].append(np.stack([number("transl", 3), shift]))
+    return _assembled(list(known), rotation, columns, np.stack([cameras[frame][0] for frame in known]))
+
+
+def _assembled(
+    frames: list[int], rotation: np.ndarray, columns: dict[str, list[np.ndarray]], turns: np.ndarray
+) -> InitialPoses:
+    """The poses of all frames as one."""
+    hands, transl = np.stack(columns["hands"]), np.stack(columns["transl"])
+    full = hands.shape[2] == 45
+    if full:
+        rotation[:, 25:] = hands.reshape(len(frames), 30, 3)
+    return InitialPoses(
+        frames=tuple(frames),
+        rotation=torch.from_numpy(rotation),
+        expression=torch.from_numpy(np.stack(columns["expression"])),
+        betas=torch.from_numpy(np.median(np.stack(columns["betas"]), axis=0)),
+        transl=torch.from_numpy(_place(transl[:, 0], transl[:, 1], turns)),
+        valid=torch.ones(len(frames), dtype=torch.bool),
+        pivot=torch.tensor(ROOT),
+        hands="mean",
+        hand_pca=None if full else torch.from_numpy(hands),
+    )
+
+
+def _place(transl: np.ndarray, shift: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """The root joint in the cameras, R (J_0 + transl) + t, relative to J_0 of SMPL-X's mean body."""
+    root = np.array(ROOT)
+    return np.einsum("tij,tj->ti", turns, root + transl) + shift - root
+
+
+ROOT = (0.0031, -0.3514, 0.0120)
+"""J_0 of SMPL-X's neutral mean body, metres. A person's own differs by some mm to 2 cm."""

@@ -1,0 +1,176 @@
+"""ZJU-MoCap: 23 cameras in a room that stand still.
+
+::
+
+    annots.npy                a pickled dictionary: cams {K, D, R, T}, ims [{ims: [path, ...]}, ...]
+    <camera>/000123.jpg       as annots names them
+    mask/<camera>/000123.png  not zero is the person
+    smpl_params/123.npy       a pickled dictionary: Rh, Th, shapes, poses
+
+Source: peers.md B (GauHuman, GART). Conversions: T is millimetres. K and D are OpenCV's, which counts from
+the centre of the first pixel, so half a pixel is added; the distortion is taken out of the pictures.
+EasyMocap turns the posed body about the ORIGIN, x = R(Rh) x_posed + Th with the root's own rotation zero,
+so SMPL's root joint comes to be at R(Rh) J_0 + Th (``smpl`` says what J_0 is, and how 72 numbers become
+SMPL-X's).
+
+Read in two ways. As the paper and FlexiAvatar do: one camera as a video, ``ingest.camera_name`` says which
+by its number, 4 if nothing is said. As GauHuman does: ``ingest.test_cameras=others``, or numbers, holds out
+other cameras: then the frames learnt from are 0 to 495, every fifth, and those held out 0 to 480 of each,
+every thirtieth. (GauHuman halves the pictures; here ``ingest.long_side`` says how large they are.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import UserError
+from pipeline.pose_files import InitialPoses
+from pipeline.untrusted import inside, read_npy
+from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation
+from stages.ingest.cameras.world import settle
+from stages.ingest.datasets.recording import STEP, Recording, Shot, entry, folder_clip, numbers
+from stages.ingest.datasets.smpl import ROOT, smpl_poses
+from stages.ingest.settings import IngestSettings
+
+FPS = 50.0
+TRAIN_CAMERA = 4
+TRAIN_FRAMES, TEST_FRAMES = range(0, 500, 5), range(0, 17 * 30, 30)
+_REMEDY = "unpack the ZJU-MoCap subject again"
+
+
+@dataclasses.dataclass(frozen=True)
+class Eye:
+    """A camera: as it is handed on, and as annots.npy has it (world-to-camera, metres)."""
+
+    view: View
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+def recognises(folder: Path) -> bool:
+    """Its index is there."""
+    return (folder / "annots.npy").is_file()
+
+
+def read(source: Path, settings: IngestSettings) -> Recording:
+    """Read a subject's folder; UserError where a file of it is malformed."""
+    path = source / "annots.npy"
+    annots = read_npy(path, _REMEDY)
+    names = _names(annots, path)
+    count = len(names[0])
+    train = _camera(settings.camera_name or str(TRAIN_CAMERA), count, path)
+    test = _held_out(settings.test_cameras, train, count, path)
+    eyes = _eyes(annots, [train, *test], source, names)
+    several = bool(test)
+    shots = [_shot(source, names, train, 0, eyes[0], list(TRAIN_FRAMES) if several else None, path)]
+    for place, camera in enumerate(test, start=1):
+        shots.append(_shot(source, names, camera, place * STEP, eyes[place], list(TEST_FRAMES), path))
+    if not several:
+        return Recording("zju", tuple(shots))
+    held = frozenset(frame for shot in shots[1:] for frame in shot.clip.pictures)
+    return Recording("zju", tuple(shots), frozenset(shots[0].clip.pictures), held)
+
+
+def _names(annots: Any, path: Path) -> list[list[str]]:
+    """The picture names, by frame and camera."""
+    frames = entry(annots, "ims", path, _REMEDY)
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{path}: 'ims' is no list of frames: {_REMEDY}")
+    names = [entry(frame, "ims", path, _REMEDY) for frame in frames]
+    names = [list(np.ravel(one)) if isinstance(one, np.ndarray) else one for one in names]
+    fits = all(isinstance(one, list) and len(one) == len(names[0]) > 0 for one in names)
+    if not fits or not all(isinstance(name, str) for one in names for name in one):
+        raise UserError(f"{path}: 'ims' does not name as many pictures in each frame: {_REMEDY}")
+    return names
+
+
+def _camera(name: str, count: int, path: Path) -> int:
+    if not (name.isdigit() and int(name) < count):
+        raise UserError(f"{path} has cameras 0 to {count - 1}, not '{name}': set ingest.camera_name to one")
+    return int(name)
+
+
+def _held_out(names: tuple[str, ...], train: int, count: int, path: Path) -> list[int]:
+    if names == ("others",):
+        return [camera for camera in range(count) if camera != train]
+    return [camera for camera in (_camera(name, count, path) for name in names) if camera != train]
+
+
+def _eyes(annots: Any, cameras: list[int], source: Path, names: list[list[str]]) -> list[Eye]:
+    """The cameras in one world, in which the first one stands as ``cameras.world`` says."""
+    path = source / "annots.npy"
+    tables = entry(annots, "cams", path, _REMEDY)
+    rotations, translations, lenses = [], [], []
+    for camera in cameras:
+        parts = {}
+        for key, shape in (("K", (3, 3)), ("D", (-1,)), ("R", (3, 3)), ("T", (3,))):
+            table = entry(tables, key, path, _REMEDY)
+            if camera >= len(table):
+                raise UserError(f"{path}: '{key}' has no camera {camera}: {_REMEDY}")
+            parts[key] = numbers(table[camera], shape, f"{path}, '{key}' of camera {camera}", _REMEDY)
+        check_rotation(parts["R"], f"{path}, camera {camera}")
+        rotations.append(parts["R"])
+        translations.append(parts["T"] / 1000.0)
+        clip = folder_clip(source, {0: inside(source, names[0][camera], path)})
+        lenses.append(_lens(parts["K"], parts["D"], clip.width, clip.height))
+    settled = settle(np.stack(rotations), np.stack(translations))
+    rows = zip(lenses, *settled, rotations, translations, strict=True)
+    return [Eye(View(lens, turn, shift), *original) for lens, turn, shift, *original in rows]
+
+
+def _lens(matrix: np.ndarray, bend: np.ndarray, width: int, height: int) -> pycolmap.Camera:
+    bend = np.concatenate([bend, np.zeros(5)])[:5]  # k1, k2, p1, p2, k3
+    place = [matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5]
+    params = [*place, *bend, 0.0, 0.0, 0.0]
+    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+
+
+def _shot(
+    source: Path,
+    names: list[list[str]],
+    camera: int,
+    first: int,
+    eye: Eye,
+    chosen: list[int] | None,
+    path: Path,
+) -> Shot:
+    """One camera's frames, numbered from ``first``."""
+    frames = [frame for frame in chosen or range(len(names)) if frame < len(names)]
+    pictures = {frame: inside(source, names[frame][camera], path) for frame in frames}
+    masks = {frame: _mask(source, names[frame][camera], path) for frame in frames}
+    found = {first + frame: mask for frame, mask in masks.items() if mask.is_file()}
+    clip = folder_clip(source, {first + frame: file for frame, file in pictures.items()}, FPS)
+    calibration = Calibration(path, "ZJU-MoCap", {EVERY_FRAME: eye.view}, metric=True, upright=True)
+    return Shot(clip, calibration, None, found or None, "nonzero", _poses(source, frames, first, eye))
+
+
+def _mask(source: Path, name: str, path: Path) -> Path:
+    return inside(source / "mask", name, path).with_suffix(".png")
+
+
+def _poses(source: Path, frames: list[int], first: int, eye: Eye) -> InitialPoses | None:
+    """SMPL's poses in the axes of one camera."""
+    paths = {frame: source / "smpl_params" / f"{frame}.npy" for frame in frames}
+    known = [frame for frame, path in paths.items() if path.is_file()]
+    if not known:
+        return None
+    turns, places, poses, shapes = [], [], [], []
+    for frame in known:
+        value = read_npy(paths[frame], _REMEDY)
+        parts = {
+            key: numbers(entry(value, key, paths[frame], _REMEDY), shape, f"{paths[frame]}, '{key}'", _REMEDY)
+            for key, shape in (("Rh", (3,)), ("Th", (3,)), ("poses", (72,)), ("shapes", (-1,)))
+        }
+        turn = Rotation.from_rotvec(parts["Rh"]).as_matrix()
+        turns.append(eye.rotation @ turn)
+        places.append(eye.rotation @ (turn @ ROOT + parts["Th"]) + eye.translation)
+        poses.append(parts["poses"])
+        shapes.append(parts["shapes"])
+    placed = [first + frame for frame in known]
+    return smpl_poses(placed, np.stack(poses), np.stack(turns), np.stack(places), np.median(shapes, axis=0))
