@@ -20,6 +20,7 @@ from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region, Residuals, regions
 from pipeline.avatar.restrict import active_rows, restricted
+from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
 from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms
@@ -109,10 +110,12 @@ class Avatar(nn.Module):
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
+        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``skin.py``.
     """
 
     base_color: Tensor
     active: Tensor
+    skin_rows: Tensor
 
     def __init__(
         self,
@@ -148,6 +151,8 @@ class Avatar(nn.Module):
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
         self.register_buffer("active", torch.ones(len(kept), dtype=torch.bool))
+        self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
+        self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
         self._restricted: dict[int, tuple[Tensor, Surface]] = {}
         self._build_networks(seed)
@@ -199,6 +204,25 @@ class Avatar(nn.Module):
             rows = active_rows(self.surfaces[0].canonical, self.active, level)
             known = self._restricted[level] = self.active.clone(), restricted(full, rows)
         return known[1]
+
+    @torch.no_grad()
+    def reskin(self) -> None:
+        """Gives points off head and hands the skinning weights of the vertex that they now lie nearest."""
+        decoded = self.decode()
+        points = decoded.surface.canonical.vertices + decoded.offset
+        free = decoded.surface.pliable[:, 0] > 0
+        rows = nearest_rows(points, self.surfaces[0].canonical.vertices, free)
+        self.skin_rows.index_copy_(0, decoded.surface.pick(torch.arange(len(self.skin_rows))), rows)
+        self.apply_skin()
+
+    def apply_skin(self) -> None:
+        """Puts ``skin_rows`` into effect on every level; to be called when they have been loaded."""
+        original = self._own_surfaces[0].canonical
+        for level, own in enumerate(self._own_surfaces):
+            mesh = with_weights_of(own.canonical, original, self.skin_rows[: len(own.canonical)])
+            self.surfaces[level] = dataclasses.replace(own, canonical=mesh, rig=Rig.build(mesh))
+        self._restricted.clear()
+        self._baked = None
 
     def train(self, mode: bool = True) -> Avatar:
         """As of ``nn.Module``; forgets what was decoded, since weights are about to change."""

@@ -78,6 +78,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
         avatar.load_state_dict(weights)
     except RuntimeError as error:
         raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    avatar.apply_skin()
     avatar.pose_heads_active = header["pose_heads_active"]
     avatar.residuals_active = header["residuals_active"]
     avatar.unseen = header["unseen"]

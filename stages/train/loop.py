@@ -86,6 +86,8 @@ class Trainer:
         self.iteration += 1
         if self.gate is not None and self.gate.due(self.iteration):
             self.gate.update()
+        if self.settings.skinning == "nearest" and self.iteration % self.settings.skin_every == 0:
+            self.avatar.reskin()
         return values
 
     @property
@@ -123,6 +125,7 @@ class Trainer:
     def resume(self, checkpoint: Checkpoint) -> None:
         """Goes back to where ``checkpoint`` was taken."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
+        self.avatar.apply_skin()
         self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
         self._update_phase()
 

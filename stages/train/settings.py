@@ -10,6 +10,7 @@ from typing import Any
 # originals in pipeline/avatar/residual.py and pipeline/metrics/lpips.py.
 NETWORKS = ("alex", "vgg")
 PLACES = ("canonical", "posed")
+SKINNINGS = ("own", "nearest")
 DEFINITIONS = ("in_frame", "contributes")
 GUARDS = ("evidence", "authors")
 UNSEEN = ("nothing", "base", "generated")
@@ -20,7 +21,7 @@ PARTS = (
 COUNTS = (
     "iterations", "batch", "held_out_every", "checkpoint_every", "color_frames", "gate_every", "groups",
     "lpips_every",
-    "plane_channels", "width", "residual_width",
+    "plane_channels", "width", "residual_width", "skin_every",
 )  # fmt: skip
 FRACTIONS = (
     "subdivide_from", "pose_heads_from", "refine_from", "residual_from", "gate_from", "time_dropout",
@@ -62,6 +63,10 @@ class TrainSettings:
     scale: float = 0.55  # initial standard deviation of a Gaussian, in mean edge lengths
     thickness: float = 0.5  # initial standard deviation along the normal, in those along the surface
     opacity: float = 0.999  # of every Gaussian
+    skinning: str = (
+        "own"  # weights of the Gaussian's own vertex; "nearest": of the vertex it has come to lie at
+    )
+    skin_every: int = 100  # iterations between two looks at which vertex is nearest
     pose_heads_from: float = 0.4  # fraction of the run from which the pose heads take part; 1: never
     # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
     pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices

@@ -317,3 +317,21 @@ def test_person_box_holds_every_mask_and_stays_in_the_frame(tmp_path):
         write_mask(tmp_path / "masks", frame, mask)
     box = stage.person_box(tmp_path, (0, 1), 8)
     assert (box.left, box.top, box.right, box.bottom) == (0, 12, 48, 64)
+
+
+def test_resumed_run_takes_up_the_skinning_weights_where_they_were(subject, tmp_path):
+    settings = {"skinning": "nearest", "skin_every": 4, "face": 0.0}
+    through, stopped, resumed = (
+        trainer_for(context_for(subject, tmp_path / name, **settings)) for name in ("one", "two", "three")
+    )
+    for _ in range(8):
+        through.step()
+    for _ in range(6):
+        stopped.step()
+    resumed.resume(stopped.checkpoint("key"))
+    assert bool((resumed.avatar.skin_rows >= 0).any())
+    for _ in range(2):
+        resumed.step()
+    assert torch.equal(resumed.avatar.skin_rows, through.avatar.skin_rows)
+    weights = [torch.nn.utils.parameters_to_vector(one.avatar.parameters()) for one in (through, resumed)]
+    assert torch.equal(*weights)
