@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=2,
+    version=3,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
@@ -17,7 +17,15 @@ STAGE = Stage(
             "footage.json",
         ),
         "fit": ("poses.parquet", "curve.parquet", "overlay.mp4", "overlay.png"),
-        "train": ("avatar.safetensors", "curve.parquet", "visibility.parquet", "poses.parquet"),
+        "plan": ("plan.json",),
+        "train": (
+            "avatar.safetensors",
+            "curve.parquet",
+            "visibility.parquet",
+            "gate.json",
+            "visibility.png",
+            "poses.parquet",
+        ),
     },
     assets=("lpips",),
     reads_body=True,

@@ -6,6 +6,8 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.curves import Line
 
 if TYPE_CHECKING:
@@ -50,6 +52,23 @@ def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
     return {**found, "regularisers": sorted(rest.items())} if rest else found
 
 
+def draw_scores(scores: np.ndarray, tau: float) -> list[str]:
+    """The histogram of visibility scores with the gate's line on it, an SVG; none without scores.
+
+    Args:
+        scores: [V] in [0, 1].
+        tau: the line; 0 for none.
+    """
+    if not scores.any():
+        return []
+    counts, edges = np.histogram(scores, np.linspace(0, 1, 65))
+    steps = [(float(edge), float(count)) for edge, count in zip(edges, counts, strict=False)]
+    group = {"body vertices": [*steps, (1.0, float(counts[-1]))]}
+    if tau:
+        group[f"tau* = {tau:.2f}"] = [(tau, 0.8), (tau, float(counts.max()))]
+    return [_draw("how often each vertex is seen", group, "score")]
+
+
 def _draw(title: str, group: Mapping[str, Sequence[tuple[float, float]]], across: str = "iteration") -> str:
     # Slow to import, and only this function draws.
     import matplotlib
@@ -70,11 +89,17 @@ def _fill(axes: Axes, title: str, group: Mapping[str, Sequence[tuple[float, floa
 
     for color, (label, line) in zip(_COLORS, group.items(), strict=False):
         places, values = zip(*line, strict=True)
+        if across == "score":
+            style = "steps-post" if label == "body vertices" else "default"
+            axes.plot(places, np.maximum(values, 0.8), color=color, drawstyle=style, label=label)
+            continue
         axes.plot(places, values, color=color, linewidth=1.8, marker="o", markersize=3, label=label)
     if title == "loss" and all(value > 0 for line in group.values() for _, value in line):
         axes.set_yscale("log")
+    if across == "score":
+        axes.set_yscale("log")
     axes.set_title(title, loc="left", color=_INK, fontsize=10)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=across != "score"))
     axes.set_xlabel(across, color=_INK)
     axes.tick_params(which="both", colors=_INK)
     axes.grid(color=_INK, alpha=0.25, linewidth=0.6)

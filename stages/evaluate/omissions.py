@@ -53,8 +53,8 @@ def _of_the_avatar(gate: Gate) -> list[Omission]:
         return []
     share = 100 * (1 - gate.kept / gate.vertices)
     why = (
-        f"{gate.vertices - gate.kept} of {gate.vertices} body vertices ({share:.0f}%) were seen in no "
-        "training frame, so no Gaussians stand there; in the turn one looks through those places"
+        f"{gate.vertices - gate.kept} of {gate.vertices} body vertices ({share:.0f}%) were in too few "
+        "training frames, so no Gaussians stand there; in the turn one looks through those places"
     )
     return [Omission("What the clip never showed", why)]
 

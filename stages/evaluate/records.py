@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from pipeline.artifact import MANIFEST, RUN
@@ -14,8 +15,9 @@ from pipeline.errors import UserError
 from pipeline.records import read_json
 from pipeline.tables import read_table
 
-VISIBILITY = pa.schema([("kept", pa.bool_())])
-"""The one column of train's visibility.parquet that is read: whether a body vertex carries a Gaussian."""
+VISIBILITY = pa.schema([("captured", pa.float32()), ("kept", pa.bool_())])
+"""The columns of train's visibility.parquet that are read: each body vertex's score, and whether it carries
+a Gaussian."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,10 +42,18 @@ class Gate:
     Attributes:
         kept: body vertices that carry Gaussians.
         vertices: body vertices in all.
+        scores: [V], how often each of them is in a captured frame.
+        tau: the line under which the gate takes them; 0 where it is open.
+        why: the gate's own sentence.
+        definition: what counted as seen; None where nothing was counted.
     """
 
     kept: int
     vertices: int
+    scores: np.ndarray
+    tau: float
+    why: str
+    definition: str | None
 
 
 def stage_records(inputs: Mapping[str, Path]) -> list[StageRecord]:
@@ -73,14 +83,28 @@ def fit_seconds(fit: Path) -> dict[int, float]:
     return {step: float(at) for step, at in pairs if isinstance(step, int) and isinstance(at, int | float)}
 
 
-def read_gate(path: Path) -> Gate:
-    """How many of the body's vertices train's ``visibility.parquet`` kept.
+def read_gate(train: Path) -> Gate:
+    """What train's ``visibility.parquet`` and ``gate.json`` say.
 
     Raises:
-        UserError: the file is missing or damaged.
+        UserError: a file is missing or damaged.
     """
-    kept = read_table(path, VISIBILITY, "run the train stage again")["kept"]
-    return Gate(int(kept.sum()), len(kept))
+    remedy = "run the train stage again"
+    table = read_table(train / "visibility.parquet", VISIBILITY, remedy)
+    line = read_json(train / "gate.json", remedy)
+    if not isinstance(line, dict) or not {"tau", "why", "definition"} <= set(line):
+        raise UserError(f"{train / 'gate.json'} does not say where the line is: {remedy}")
+    kept = table["kept"]
+    return Gate(
+        int(kept.sum()), len(kept), table["captured"], float(line["tau"]), line["why"], line["definition"]
+    )
+
+
+def plan_savings(train: Path) -> dict[str, dict[str, float]]:
+    """What train measured of the effects that it left out; empty where not recorded."""
+    timings = _read(train / RUN).get("timings")
+    found = timings.get("saved") if isinstance(timings, dict) else None
+    return {name: each for name, each in (found or {}).items() if isinstance(each, dict)}
 
 
 def _read(path: Path) -> dict[str, Any]:

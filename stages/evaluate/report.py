@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from stages.evaluate.omissions import Omission
 from stages.evaluate.pictures import Comparison
+from stages.evaluate.plan_table import PlanRow
 from stages.evaluate.records import StageRecord
 from stages.evaluate.scoring import AVATAR, HELD_OUT
 from stages.evaluate.summary import LABELS, METRIC_LABELS, best, lower_is_better, number, rows
@@ -39,6 +40,10 @@ class Material:
         overlay: the fit drawn over the clip, MP4, and the same as one picture; whichever exists.
         curve: drawings of the training curve, SVG.
         fit_curve: drawings of what accuracy cost the registration, SVG.
+        plan: what the scene called for, a row an effect.
+        scores: drawing of the visibility scores, SVG; none where nothing was counted.
+        gate: the gate's own sentence.
+        score_picture: the body coloured by score, where it exists.
         omissions: what was left out.
         stages: upstream first.
     """
@@ -52,6 +57,10 @@ class Material:
     overlay: Sequence[Path]
     curve: Sequence[str]
     fit_curve: Sequence[str]
+    plan: Sequence[PlanRow]
+    scores: Sequence[str]
+    gate: str
+    score_picture: Path
     omissions: Sequence[Omission]
     stages: Sequence[StageRecord]
 
@@ -82,6 +91,10 @@ def _contents(material: Material) -> dict[str, Any]:
         "overlay": _overlay(material.overlay),
         "curve": [Markup(drawing) for drawing in material.curve],
         "fit_curve": [Markup(drawing) for drawing in material.fit_curve],
+        "plan": material.plan,
+        "scores": [Markup(drawing) for drawing in material.scores],
+        "gate": material.gate,
+        "score_picture": _overlay([material.score_picture]),
         "omissions": material.omissions,
         "stages": material.stages,
         "total": _total(material.stages),

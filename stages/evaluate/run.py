@@ -17,16 +17,18 @@ from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import shown
 from pipeline.metrics import EROSION, Lpips
+from pipeline.plan import read_plan
 from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context
 from stages.evaluate.assessment import Assessment, assess, scored_frames
-from stages.evaluate.curve import draw_curve, draw_fit
+from stages.evaluate.curve import draw_curve, draw_fit, draw_scores
 from stages.evaluate.evidence import Evidence, read_evidence
 from stages.evaluate.omissions import omissions
 from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
-from stages.evaluate.records import StageRecord, fit_seconds, read_gate, stage_records
+from stages.evaluate.plan_table import plan_rows
+from stages.evaluate.records import StageRecord, fit_seconds, plan_savings, read_gate, stage_records
 from stages.evaluate.rendering import Animate, on_grey, render_frame
 from stages.evaluate.report import Material, write_report
 from stages.evaluate.scoring import Scorer, table, write_scores
@@ -89,7 +91,8 @@ def gather(
 ) -> Material:
     """What the report shows, from this stage and from the upstream stages' folders."""
     fit, train, settings = context.inputs["fit"], context.inputs["train"], context.settings
-    gate = read_gate(train / "visibility.parquet")
+    gate = read_gate(train)
+    plan = read_plan(context.inputs["plan"] / "plan.json")
     return Material(
         summary=summary,
         clip=describe_clip(evidence),
@@ -100,6 +103,10 @@ def gather(
         overlay=(fit / "overlay.mp4", fit / "overlay.png"),
         curve=draw_curve(read_curve(train / "curve.parquet", "run the train stage again")),
         fit_curve=draw_fit(read_curve(fit / "curve.parquet", "run the fit stage again"), fit_seconds(fit)),
+        plan=plan_rows(plan, plan_savings(train)),
+        scores=draw_scores(gate.scores, gate.tau),
+        gate=gate.why,
+        score_picture=train / "visibility.png",
         omissions=omissions(evidence, settings, assessment.scores, gate),
         stages=[*stage_records(context.inputs), own],
     )

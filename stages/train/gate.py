@@ -144,8 +144,12 @@ class Gate(nn.Module):
             return fixed_threshold(scores, settings.gate_threshold)
         return authors_threshold(scores) if settings.gate_guard == "authors" else evidence_threshold(scores)
 
-    def write(self, folder: Path) -> None:
-        """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the line."""
+    def write(self, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the line.
+
+        Returns:
+            The scores of the whole body, the higher of captured and generated, and what is kept; [V] each.
+        """
         captured, generated = self.scores()
         write_visibility(
             folder / "visibility.parquet",
@@ -160,6 +164,7 @@ class Gate(nn.Module):
             "drawn": {"captured": int(self.looked[CAPTURED].max()), "generated": int(self.looked[1].max())},
         }
         write_json(folder / "gate.json", content)
+        return self.whole_body(torch.maximum(captured, generated)), self.whole_body(self.avatar.active) == 1
 
 
 def write_ungated(folder: Path, vertices: int) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
 from pipeline.errors import UserError
+from pipeline.frames import write_png
 from pipeline.metrics import Lpips
 from pipeline.person import person_box
 from pipeline.plan import read_plan
@@ -21,12 +22,14 @@ from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
+from stages.train.costs import saved
 from stages.train.data import Frames, scenery_of, spread
 from stages.train.gate import Gate, write_ungated
 from stages.train.loop import Trainer, describe, point_values
 from stages.train.obey import obey
 from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
+from stages.train.score_picture import score_picture
 from stages.train.settings import TrainSettings
 from stages.train.visibility import ever_in_frame, fill_unseen, first_colors, with_surroundings
 
@@ -60,9 +63,10 @@ class Inputs:
 def run(context: Context) -> None:
     """Trains the avatar of one subject.
 
-    Publishes ``avatar.safetensors``, ``curve.parquet``, ``visibility.parquet``, ``gate.json`` and
-    ``poses.parquet`` (the training frames' refined, all others as fitted). Goes on from
-    ``context.work`` if a run of the same settings and inputs was killed.
+    Publishes ``avatar.safetensors``, ``curve.parquet``, ``visibility.parquet``, ``gate.json``,
+    ``visibility.png`` where anything was counted, and ``poses.parquet`` (the training frames' refined,
+    all others as fitted). Goes on from ``context.work`` if a run of the same settings and inputs was
+    killed.
 
     Raises:
         UserError: if the inputs do not go together, or training diverges.
@@ -84,11 +88,12 @@ def train_subject(context: Context) -> None:
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()
-    publish(trainer, len(inputs.body.v_template), context)
+    publish(trainer, inputs.body, context)
+    context.timing("saved", saved(avatar, len(inputs.body.v_template), context.settings, settings))
 
 
-def publish(trainer: Trainer, vertices: int, context: Context) -> None:
-    """Writes the finished avatar, of a body of so many vertices, and what is known of its making."""
+def publish(trainer: Trainer, body: BodyModel, context: Context) -> None:
+    """Writes the finished avatar and what is known of its making."""
     avatar, output = trainer.avatar, context.output
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
@@ -97,9 +102,10 @@ def publish(trainer: Trainer, vertices: int, context: Context) -> None:
     write_poses(output / "poses.parquet", trainer.poses.refined())
     trainer.curve.write(output / "curve.parquet")
     if trainer.gate is None:
-        write_ungated(output, vertices)
+        write_ungated(output, len(body.v_template))
     else:
-        trainer.gate.write(output)
+        scores, kept = trainer.gate.write(output)
+        write_png(output / "visibility.png", score_picture(body, avatar.identity, scores, kept))
 
 
 def read_inputs(context: Context) -> Inputs:

@@ -2,20 +2,23 @@
 
 import dataclasses
 
+import numpy as np
 import torch
 
 from pipeline.body import Poses, write_poses
 from pipeline.camera import facing_camera
 from pipeline.curves import Curve
 from pipeline.frames import write_frame, write_mask
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.plan import write_plan
+from pipeline.records import Footage, Split, write_cameras, write_footage, write_json, write_split
 from pipeline.splat import Gaussians, render
 from pipeline.stage import Context
 from stages.evaluate.evidence import read_evidence
 from stages.evaluate.run import evaluate
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
-from stages.train.visibility import Visibility, write_visibility
+from stages.train.gate import write_visibility
+from tests.plans import plan_of
 
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
 TEST = FRAMES[-3:]
@@ -81,10 +84,10 @@ class Clip:
 
 
 def make_clip(root, test=TEST):
-    inputs = {name: root / name for name in ("ingest", "fit", "train")}
+    inputs = {name: root / name for name in ("ingest", "fit", "plan", "train")}
     for folder in (*inputs.values(), inputs["ingest"] / "frames", inputs["ingest"] / "masks"):
         folder.mkdir()
-    ingest, fit, train = inputs.values()
+    ingest, fit, plan, train = inputs.values()
     camera, poses = facing_camera(WIDTH, HEIGHT, 70.0), moving_poses()
     for row, frame in enumerate(FRAMES):
         rendering = render(stand_in(poses.rotation[row], None, poses.transl[row], None), camera)
@@ -106,6 +109,10 @@ def make_clip(root, test=TEST):
     points.write(train / "curve.parquet")
     registration = Curve([(0, "pixels", 20.0), (50, "pixels", 2.0)])
     registration.write(fit / "curve.parquet")
-    kept = torch.arange(50) < 40
-    write_visibility(train / "visibility.parquet", Visibility(3, kept.long() * 3, kept.float(), kept))
+    kept = np.arange(50) < 40
+    write_visibility(
+        train / "visibility.parquet", captured=kept * 1.0, generated=kept * 0.0, early=~kept, kept=kept
+    )
+    write_json(train / "gate.json", {"tau": 0.5, "why": "20% of the body is under 0.50", "definition": "x"})
+    write_plan(plan / "plan.json", plan_of(pose_heads=False))
     return Clip(root, inputs)

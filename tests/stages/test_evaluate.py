@@ -12,17 +12,17 @@ from rich.console import Console
 from pipeline.body import Poses, write_poses
 from pipeline.curves import read_curve
 from pipeline.errors import UserError
-from pipeline.frames import write_mask
+from pipeline.frames import write_mask, write_png
 from pipeline.metrics import PSNR_CAP
 from pipeline.splat import read_ply
-from stages.evaluate import STAGE, curve, records
+from stages.evaluate import STAGE, curve, plan_table, records
 from stages.evaluate.evidence import evenly, read_evidence
 from stages.evaluate.run import evaluate, report_place
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import show_summary
 from stages.evaluate.turntable import relaxed_pose
-from stages.train.visibility import SCHEMA as VISIBILITY
+from stages.train.gate import SCHEMA as VISIBILITY
 from tests.stages.evaluate_subject import (
     FRAMES,
     HEIGHT,
@@ -177,7 +177,7 @@ def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip
     report = (clip.evaluate() / "report.html").read_text()
     assert "12.3" in report and "fit.iterations" in report and "a, b" in report
     assert "what accuracy cost" in report
-    assert report.count("not recorded") == 2
+    assert report.count("not recorded") == 3  # ingest, plan and train
 
 
 def test_what_users_name_is_escaped(clip):
@@ -196,8 +196,9 @@ def test_the_fits_overlay_is_embedded(clip, name, kind):
 def test_curve_and_visibility_are_read_as_train_writes_them(clip):
     lines = read_curve(clip.inputs["train"] / "curve.parquet", "run train again")
     assert lines["psnr"] == [(10, 30.0), (20, 40.0), (30, 50.0)]
-    assert records.read_gate(clip.inputs["train"] / "visibility.parquet") == records.Gate(40, 50)
-    assert VISIBILITY.field("kept") == records.VISIBILITY.field("kept")
+    gate = records.read_gate(clip.inputs["train"])
+    assert (gate.kept, gate.vertices, gate.tau) == (40, 50, 0.5) and gate.scores.sum() == 40
+    assert all(VISIBILITY.field(one.name) == one for one in records.VISIBILITY)
     with pytest.raises(UserError, match="train stage again"):
         read_curve(clip.inputs["train"] / "visibility.parquet", "run the train stage again")
 
@@ -260,4 +261,25 @@ def test_settings_that_cannot_work_are_refused(settings, message):
 
 def test_the_stage_reads_what_it_declares():
     assert STAGE.settings is EvaluateSettings and STAGE.assets == ("lpips",)
-    assert set(STAGE.needs) == {"ingest", "fit", "train"}
+    assert set(STAGE.needs) == {"ingest", "fit", "plan", "train"}
+
+
+def test_the_plan_and_the_scores_are_shown(clip):
+    write_png(clip.inputs["train"] / "visibility.png", np.full((4, 8, 3), 90, np.uint8))
+    saved = {"timings": {"saved": {"pose_heads": {"seconds": 12.3}, "visibility_gate": {"gaussians": 10}}}}
+    (clip.inputs["train"] / "run.json").write_text(json.dumps(saved))
+    report = (clip.evaluate() / "report.html").read_text()
+    assert "What this scene called for" in report and "12.3 s of training" in report
+    assert "10 body vertices without a Gaussian" in report
+    assert "tau* = 0.50" in report and "coloured by how often" in report
+
+
+def test_nothing_counted_draws_nothing():
+    assert curve.draw_scores(np.zeros(50), 0.0) == []
+    scores = np.linspace(0, 1, 50)
+    assert curve.draw_scores(scores, 0.3) == curve.draw_scores(scores, 0.3)
+
+
+def test_savings_in_words():
+    assert plan_table.saved({}) == ""
+    assert plan_table.saved({"seconds": 1.26}) == "1.3 s of training"

@@ -1,0 +1,163 @@
+"""The pictures and numbers of ``benchmarks.visibility`` that look beside the held-out frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.camera import Camera, facing_camera, project
+from pipeline.frames import read_frame, read_mask, write_png
+from pipeline.metrics import composite
+from pipeline.records import read_cameras
+from pipeline.splat import Rendering, render
+from stages.train.loop import Trainer
+from stages.train.settings import TrainSettings
+
+VIEW = "above"  # of the mannequin's unseen cameras, the one that shows most of what no frame did
+BACK = 2.2  # metres that the wide camera stands behind the filming one
+STEPS = 24  # whose gradients are added up
+REACH = 6  # pixels about a seen vertex that count as the seen region
+
+
+def unseen_error(subject: Any, trainer: Trainer, folder: Path | None) -> dict[str, float]:
+    """What a camera that never was sees outside of what the clip showed.
+
+    Returns:
+        ``outside``: the mean absolute difference from the truth there, person on black, of a mannequin's
+        unseen camera. ``ghost``: pixels that a camera farther back finds covered by what no training frame
+        showed, for any subject.
+    """
+    found = {"ghost": ghost(subject, trainer, folder)}
+    views = subject.folders["ingest"] / "views" / VIEW
+    if not views.is_dir():
+        return found
+    total, pixels = 0.0, 0
+    for frame, camera in read_cameras(views / "cameras.parquet").items():
+        row = subject.inputs.poses.index(frame)
+        rendering, seen = _rendered(subject, trainer, row, camera)
+        truth = composite(read_frame(views / "frames", frame), read_mask(views / "masks", frame))
+        total += float((rendering.color.clamp(0, 1) - truth).abs().mean(-1)[~seen].sum())
+        pixels += int((~seen).sum())
+    return found | {"outside": total / max(1, pixels)}
+
+
+def ghost(subject: Any, trainer: Trainer, folder: Path | None) -> float:
+    """Alpha outside the seen region, summed over the pixels of one wide view."""
+    row = subject.inputs.poses.index(subject.inputs.split.test[0])
+    camera = facing_camera(256, 256, 1.2 * 256)
+    wide = dataclasses.replace(camera, translation=camera.translation + torch.tensor([0.0, 0.0, BACK]))
+    rendering, seen = _rendered(subject, trainer, row, wide)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        image = rendering.color + (1 - rendering.alpha[..., None]) * 0.82
+        name = f"ghost_{subject.name}_{'off' if trainer.gate is None else 'on'}.png"
+        write_png(folder / name, (image.clamp(0, 1) * 255).byte().numpy())
+    return float(rendering.alpha[~seen].sum())
+
+
+@torch.no_grad()
+def _rendered(subject: Any, trainer: Trainer, row: int, camera: Camera) -> tuple[Rendering, Tensor]:
+    """The avatar from a camera, and the pixels near a vertex that some training frame had in its picture."""
+    poses, avatar = subject.inputs.poses, trainer.avatar.eval()
+    rendering = render(
+        avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row]), camera
+    )
+    avatar.train()
+    seen = _seen_vertices(subject)
+    vertices = seen["surface"].rig.place(
+        *seen["pose"](poses.rotation[row]), poses.transl[row]
+    )[0][seen["often"]]  # fmt: skip
+    marks = np.zeros((camera.height, camera.width), np.uint8)
+    for column, line in project(camera, vertices).round().int().tolist():
+        if 0 <= column < camera.width and 0 <= line < camera.height:
+            marks[line, column] = 1
+    size = 2 * REACH + 1
+    return rendering, torch.from_numpy(cv2.dilate(marks, np.ones((size, size), np.uint8)) > 0)
+
+
+def _seen_vertices(subject: Any) -> dict[str, Any]:
+    """The body's surface, and which of its vertices at least a tenth of the training frames show."""
+    from pipeline.avatar import Architecture, Avatar
+    from pipeline.body import joint_transforms
+    from pipeline.visibility import body_in_frame
+
+    inputs = subject.inputs
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    surface = Avatar(inputs.body, inputs.identity, torch.arange(len(inputs.body.v_template)), bare).surfaces[
+        0
+    ]
+    hits = torch.zeros(len(surface.canonical))
+    for frame in inputs.split.train:
+        row = inputs.poses.index(frame)
+        camera = inputs.crops.camera(frame)
+        hits += body_in_frame(surface, inputs.poses.rotation[row], inputs.poses.transl[row], camera)
+
+    def pose(rotation: Tensor) -> tuple[Tensor, Tensor]:
+        canonical = surface.canonical
+        return joint_transforms(rotation[None], canonical.joints, canonical.parents)[0], canonical.vertices
+
+    return {"surface": surface, "pose": pose, "often": hits >= 0.1 * len(inputs.split.train)}
+
+
+def gradient_picture(
+    subject: Any, folder: Path | None, trainer_of: Callable[[Any, TrainSettings], Trainer]
+) -> dict[str, float]:
+    """The triplane's gradient magnitude with and without the gate, as in the paper's figure.
+
+    Both avatars have every body vertex and the same planes; one is gated from the first step. The number
+    is the share of the gradient's mass in cells that only gated Gaussians read.
+    """
+    masses, pictures = {}, {}
+    settings = dataclasses.replace(
+        TrainSettings(), early_gate=False, subdivisions=0, iterations=1000, gate_from=0.0, gate_every=STEPS,
+        residual_from=1.0,
+    )  # fmt: skip
+    gated = trainer_of(subject, settings)
+    for _ in range(STEPS):
+        gated.step()
+    only = _only_gated(gated)
+    for name, changes in (("with", {}), ("without", {"gate": False})):
+        trainer = trainer_of(subject, dataclasses.replace(settings, **changes))
+        if name == "with":
+            trainer.avatar.gate(gated.avatar.active)
+            trainer.gate = None
+        total = torch.zeros(len(only))
+        for _ in range(STEPS):
+            trainer.step()
+            total += trainer.avatar.triplane.planes.grad.square().sum(-1).sqrt().flatten()
+        masses[name] = float(total[only].sum() / total.sum())
+        resolution = settings.plane_resolution
+        pictures[name] = total.view(-1, 3, resolution, resolution)[0, 0].flip(0).numpy()
+    print(f"{subject.name}: gradient in cells that only gated Gaussians read: {masses}")
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        _draw(folder / f"gradient_{subject.name}.png", pictures)
+    return masses | {"cells": float(only.float().mean())}
+
+
+def _only_gated(trainer: Trainer) -> Tensor:
+    """Texels that gated Gaussians read and active ones do not, [T] bool."""
+    full, part = trainer.avatar.surfaces[0].samples, trainer.avatar.surface(0).samples
+    read = torch.zeros(2, full.matrix.shape[1], dtype=torch.bool)
+    read[0, full.matrix.col_indices().long()] = True
+    read[1, part.matrix.col_indices().long()] = True
+    return read[0] & ~read[1]
+
+
+def _draw(path: Path, pictures: dict[str, np.ndarray]) -> None:
+    highest = float(np.log10(max(picture.max() for picture in pictures.values()) + 1e-12))
+    figure, axes = plt.subplots(1, 2, figsize=(7, 3.6), layout="constrained")
+    for axis, name in zip(axes, ("without", "with"), strict=True):
+        shown = axis.imshow(np.log10(pictures[name] + 1e-12), vmin=highest - 5, vmax=highest, cmap="inferno")
+        axis.set(title=f"{name} the gate", xticks=[], yticks=[])
+    figure.colorbar(shown, ax=axes, label="log10 of the gradient's magnitude")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
