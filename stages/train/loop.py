@@ -134,7 +134,7 @@ class Trainer:
                     )
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        return {"avatar": self.avatar, "poses": self.poses}
+        return {"avatar": self.avatar, "poses": self.poses, "sight": self.objective.sight}
 
     def _poses_move(self) -> bool:
         settings = self.settings

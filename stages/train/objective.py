@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.metrics import Lpips
-from pipeline.splat import render
+from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
 from stages.train.data import Frames, View
 from stages.train.face import face_loss, face_triangles, paste
@@ -18,6 +18,7 @@ from stages.train.perceptual import crop, due, perceptual
 from stages.train.poses import FramePose, PoseRefinement
 from stages.train.regularisers import Regularisers
 from stages.train.settings import TrainSettings
+from stages.train.sight import Sight
 
 Terms = dict[str, Tensor]
 
@@ -77,6 +78,7 @@ class Objective:
         avatar, poses: what is trained.
         evidence: what it is compared with.
         settings: the weights.
+        sight: what each frame saw when it was last drawn.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class Objective:
             raise ValueError("the face term needs a texture")
         self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
         self.network, self.regularisers = network, Regularisers(avatar, settings)
+        self.sight = Sight(evidence.frames, len(avatar))
         self._face = {id(surface): face_triangles(surface.canonical) for surface in avatar.surfaces}
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
@@ -119,7 +122,7 @@ class Objective:
         draws = [self.draw(iteration * batch + place) for place in range(batch)]
         total: Terms = {}
         for draw in draws:
-            for name, value in self._frame_terms(decoded, draw, poses_move).items():
+            for name, value in self._frame_terms(decoded, draw, level, poses_move).items():
                 total[name] = total.get(name, torch.zeros(())) + value / batch
         return {**total, **self.regularisers.static(decoded)}
 
@@ -138,24 +141,28 @@ class Objective:
             place=schedule.drawn_share(seed, schedule.CROP, position),
         )
 
-    def _frame_terms(self, decoded: Decoded, draw: Draw, poses_move: bool) -> Terms:
+    def _frame_terms(self, decoded: Decoded, draw: Draw, level: int, poses_move: bool) -> Terms:
         settings, view = self.settings, self.evidence.views[draw.frame]
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
-        posed = self._pose(decoded, pose, draw)
-        terms = {**self._photometric(posed, view, draw), **self.regularisers.posed(decoded, posed)}
+        posed = self._pose(decoded, pose, draw, level)
+        rendering = render(posed.gaussians, view.camera)
+        self.sight.note(draw.frame, level, rendering.weights)
+        terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
         if settings.face and not view.generated:
             terms["face"] = settings.face * self._face_term(decoded, posed, view)
         if settings.pose_change and poses_move:
             terms["pose_change"] = settings.pose_change * self.poses.change(draw.frame)
         return terms
 
-    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw) -> Posed:
-        return self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, draw.noise, draw.time)
+    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw, level: int) -> Posed:
+        count = len(decoded.surface.canonical)
+        rows = self.sight.rows(draw.frame, level, count) if self.settings.pose_seen_only else None
+        given = pose.rotation, pose.expression, pose.transl
+        return self.avatar.pose(decoded, *given, draw.noise, draw.time, rows)
 
-    def _photometric(self, posed: Posed, view: View, draw: Draw) -> Terms:
+    def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
         """How the rendering differs from the frame, both over the drawn background."""
         settings = self.settings
-        rendering = render(posed.gaussians, view.camera)
         image = losses.over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
         if settings.mask_band:
