@@ -20,6 +20,7 @@ from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region, Residuals, regions
 from pipeline.avatar.restrict import active_rows, restricted
+from pipeline.avatar.rows import put, take
 from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
@@ -87,6 +88,8 @@ class Posed:
         log_scale: [N, 3], S_tri + Delta S_pose.
         color_logit: [N, 3], C_tri + Delta C_pose + Delta C_res.
         color_residual: [N, 3], Delta C_res; None while the residual heads are off.
+        rows: [M] int64, the Gaussians that the pose and residual heads were asked for; None for all. Of
+            the others their parts are zero.
     """
 
     gaussians: Gaussians
@@ -94,6 +97,7 @@ class Posed:
     log_scale: Tensor
     color_logit: Tensor
     color_residual: Tensor | None = None
+    rows: Tensor | None = None
 
 
 class Avatar(nn.Module):
@@ -255,6 +259,7 @@ class Avatar(nn.Module):
         transl: Tensor,  # [3]
         noise: Tensor | None = None,  # [54 * 6]
         time: float | None = None,
+        rows: Tensor | None = None,  # [M]
     ) -> Posed:
         """The Gaussians of one frame.
 
@@ -265,6 +270,8 @@ class Avatar(nn.Module):
             transl: [3], metres.
             noise: added to what the heads are told of the pose; for training.
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
+            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are asked for;
+                all if None.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
@@ -275,13 +282,13 @@ class Avatar(nn.Module):
         theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
             normals = decoded.surface.rig.normals(transforms, shape)
-            pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals)
+            pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
         means = _transform(blended, shape) + transl
         if self.residuals_active and decoded.surface.residual:
             with self._autocast():
-                residual = self.residuals(decoded.surface.residual, means, theta, time)
+                residual = self.residuals(decoded.surface.residual, means, theta, time, rows)
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
@@ -290,17 +297,23 @@ class Avatar(nn.Module):
             colors=torch.sigmoid(color_logit),
             opacities=torch.full((len(canonical),), self.architecture.opacity),
         )
-        return Posed(gaussians, pose_offset, log_scale, color_logit, residual)
+        return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
 
-    def _pose_heads(self, decoded: Decoded, theta: Tensor, normals: Tensor) -> tuple[Tensor, ...]:
+    def _pose_heads(
+        self, decoded: Decoded, theta: Tensor, normals: Tensor, rows: Tensor | None
+    ) -> tuple[Tensor, ...]:
         """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
-        features = decoded.features
+        features, count = decoded.features, len(normals)
+        if rows is not None:
+            features, normals = take(features, rows), take(normals, rows)
         with self._autocast():
             geometry = self.pose_geometry(features, theta)
             color = self.pose_color(torch.cat([features, normals], 1), theta)
-        geometry = geometry.float()
+        geometry, color = geometry.float(), color.float()
+        if rows is not None:
+            geometry, color = put(geometry, rows, count), put(color, rows, count)
         offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
-        return offset, 0.5 * geometry[:, 3:], color.float()
+        return offset, 0.5 * geometry[:, 3:], color
 
     def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
         across = canonical.spacing * self.architecture.scale

@@ -166,7 +166,14 @@ class Residuals(nn.Module):
         """gamma(t), see ``time_code`` of the module."""
         return time_code(time, self.time_range, self.time_frequencies)
 
-    def forward(self, places: tuple[Region, ...], means: Tensor, theta: Tensor, time: float | None) -> Tensor:
+    def forward(
+        self,
+        places: tuple[Region, ...],
+        means: Tensor,
+        theta: Tensor,
+        time: float | None,
+        asked: Tensor | None = None,
+    ) -> Tensor:
         """Delta C_res of every Gaussian, zero where there is no head: [N, 3] logits.
 
         Args:
@@ -174,7 +181,11 @@ class Residuals(nn.Module):
             means: [N, 3] posed centres in the world, metres.
             theta: [P], the pose without the root.
             time: seconds from the clip's start; None where there is no clock.
+            asked: [M] int64, the Gaussians that matter, all if None; of the others it is zero, too.
         """
+        if asked is not None:
+            wanted = torch.zeros(len(means), dtype=torch.bool).index_fill_(0, asked, True)
+            places = tuple(_some(region, wanted) for region in places)
         condition = torch.cat([self.time_code(time), theta])
         change = torch.zeros(len(means), 3)
         for region in places:
@@ -184,6 +195,12 @@ class Residuals(nn.Module):
             color = self.heads[region.part](encoded, condition).float()
             change = change.index_copy(0, region.rows, color)
         return change
+
+
+def _some(region: Region, wanted: Tensor) -> Region:
+    """The part's Gaussians that are wanted, [N] bool."""
+    inside = wanted[region.rows]
+    return Region(region.part, region.rows[inside], region.encoded[inside])
 
 
 def _box(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,6 +14,10 @@ from pipeline.errors import UserError
 from pipeline.splat import constants
 from pipeline.splat.dense import usable
 from pipeline.splat.gaussians import Gaussians, Rendering
+
+BUILD_TOOLS = {"nvcc": ("nvcc",), "a C++ compiler": ("c++", "g++", "clang++", "cl"), "ninja": ("ninja",)}
+# What a build that failed leaves behind, or torch says of it; gsplat itself passes over it in silence.
+BUILD_FAILED = ("'NoneType' object has no attribute", "Ninja is required", "building extension", "CUDA_HOME")
 
 
 def render_gsplat(gaussians: Gaussians, camera: Camera) -> Rendering:
@@ -54,14 +62,34 @@ def render_gsplat(gaussians: Gaussians, camera: Camera) -> Rendering:
     return Rendering(*(tensor.to(dtype) for tensor in tensors))
 
 
-def _rasterization():
-    """The entry point of gsplat."""
+def _rasterization() -> Callable[..., Any]:
+    """The entry point of gsplat, which says what is missing where its CUDA code could not be built."""
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise UserError(
-            f"rendering on CUDA needs gsplat 1.5.3, which cannot be imported ({error}): "
-            "pip install 'flexiavatar[gpu]' (it compiles on first use, with nvcc, a C++ compiler and ninja), "
-            "or render on the CPU"
-        ) from None
-    return rasterization
+        raise _unusable(error) from error
+
+    def checked(**arguments: Any) -> Any:
+        try:
+            return rasterization(**arguments)
+        except (ImportError, AttributeError, RuntimeError) as error:
+            if isinstance(error, ImportError) or any(sign in str(error) for sign in BUILD_FAILED):
+                raise _unusable(error) from error
+            raise
+
+    return checked
+
+
+def missing_tools() -> list[str]:
+    """What gsplat needs to compile its CUDA code and this machine has not."""
+    return [tool for tool, names in BUILD_TOOLS.items() if not any(map(shutil.which, names))]
+
+
+def _unusable(error: Exception) -> UserError:
+    missing = missing_tools()
+    found = f"this machine lacks {', '.join(missing)}" if missing else "all three are here"
+    return UserError(
+        f"rendering on CUDA needs gsplat 1.5.3, which cannot be used ({error}): "
+        "pip install 'flexiavatar[gpu]'. It compiles on first use, with nvcc, a C++ compiler and ninja; "
+        f"{found}. Or render on the CPU"
+    )

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.avatar import Avatar
+from pipeline.avatar.bake import bake
 from pipeline.splat import Gaussians, Rendering, render
 from stages.evaluate.evidence import Evidence
 
@@ -16,8 +18,13 @@ GREY = 0.82
 Animate = Callable[[Tensor, Tensor, Tensor, float | None], Gaussians]
 """rotation [55, 3], expression [E], transl [3], time -> Gaussians in world coordinates.
 
-The real one is ``pipeline.avatar.Avatar.gaussians``.
+The real one is that of a baked avatar, see ``animator``.
 """
+
+
+def animator(avatar: Avatar) -> Animate:
+    """The avatar as this stage needs it: posed often, and never learnt from. So it is baked once."""
+    return bake(avatar).gaussians
 
 
 @torch.no_grad()

@@ -29,7 +29,7 @@ from stages.evaluate.omissions import omissions
 from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
 from stages.evaluate.plan_table import plan_rows
 from stages.evaluate.records import StageRecord, fit_seconds, plan_savings, read_gate, stage_records
-from stages.evaluate.rendering import Animate, on_grey, render_frame
+from stages.evaluate.rendering import Animate, animator, on_grey, render_frame
 from stages.evaluate.report import Material, write_report
 from stages.evaluate.scoring import Scorer, table, write_scores
 from stages.evaluate.settings import EvaluateSettings
@@ -55,7 +55,7 @@ def run(context: Context) -> None:
     """
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", load_body(context.body_file))
     networks = {name: Lpips(context.assets["lpips"], name) for name in context.settings.lpips_networks}
-    evaluate(context, read_evidence(context.inputs), avatar.gaussians, Scorer(networks))
+    evaluate(context, read_evidence(context.inputs), animator(avatar), Scorer(networks))
 
 
 def evaluate(context: Context, evidence: Evidence, animate: Animate, scorer: Scorer) -> None:

@@ -144,7 +144,9 @@ class Trainer:
                     )
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        modules: dict[str, torch.nn.Module] = {"avatar": self.avatar, "poses": self.poses}
+        modules: dict[str, torch.nn.Module] = {
+            "avatar": self.avatar, "poses": self.poses, "sight": self.objective.sight,
+        }  # fmt: skip
         return modules if self.gate is None else {**modules, "gate": self.gate}
 
     def _poses_move(self) -> bool:

@@ -18,6 +18,7 @@ from stages.train.perceptual import crop, due, perceptual
 from stages.train.poses import FramePose, PoseRefinement
 from stages.train.regularisers import Regularisers
 from stages.train.settings import TrainSettings
+from stages.train.sight import Sight
 
 Terms = dict[str, Tensor]
 Watch = Callable[[Surface, int, FramePose, View, Tensor], None]
@@ -82,6 +83,7 @@ class Objective:
         evidence: what it is compared with.
         settings: the weights.
         watch: told of every rendering, if there is one.
+        sight: what each frame saw when it was last drawn.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Objective:
         self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
         self.network, self.regularisers = network, Regularisers(settings)
         self.watch: Watch | None = None
+        self.sight = Sight(evidence.frames, len(avatar.surfaces[-1].canonical))
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
         """The weighted terms, averaged over the frames of the step.
@@ -126,7 +129,7 @@ class Objective:
         draws = [self.draw(iteration * batch + place) for place in range(batch)]
         total: Terms = {}
         for draw in draws:
-            for name, value in self._frame_terms(decoded, draw, poses_move).items():
+            for name, value in self._frame_terms(decoded, draw, level, poses_move).items():
                 total[name] = total.get(name, torch.zeros(())) + value / batch
         return {**total, **self.regularisers.static(decoded)}
 
@@ -145,11 +148,12 @@ class Objective:
             place=schedule.drawn_share(seed, schedule.CROP, position),
         )
 
-    def _frame_terms(self, decoded: Decoded, draw: Draw, poses_move: bool) -> Terms:
+    def _frame_terms(self, decoded: Decoded, draw: Draw, level: int, poses_move: bool) -> Terms:
         settings, view = self.settings, self.evidence.views[draw.frame]
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
-        posed = self._pose(decoded, pose, draw)
+        posed = self._pose(decoded, pose, draw, level)
         rendering = render(posed.gaussians, view.camera)
+        self.sight.note(draw.frame, level, rendering.weights, decoded.surface.rows)
         if self.watch is not None:
             self.watch(decoded.surface, draw.position, pose, view, rendering.weights)
         terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
@@ -159,8 +163,12 @@ class Objective:
             terms["pose_change"] = settings.pose_change * self.poses.change(draw.frame)
         return terms
 
-    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw) -> Posed:
-        return self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, draw.noise, draw.time)
+    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw, level: int) -> Posed:
+        surface, rows = decoded.surface, None
+        if self.settings.pose_seen_only:
+            rows = self.sight.rows(draw.frame, level, len(surface.canonical), surface.rows)
+        given = pose.rotation, pose.expression, pose.transl
+        return self.avatar.pose(decoded, *given, draw.noise, draw.time, rows)
 
     def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
         """How the rendering differs from the frame, both over the drawn background."""

@@ -82,15 +82,17 @@ class Regularisers:
         """What one frame shows."""
         settings, weights = self.settings, self._of(decoded.surface)
         neighbours, colors = decoded.surface.neighbours, posed.gaussians.colors
+        same = 1.0 if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
         terms = {
-            "laplacian_scale": losses.laplacian(posed.log_scale, neighbours, weights.laplacian_scale),
-            "laplacian_color": losses.laplacian(colors, neighbours, weights.laplacian_color),
+            "laplacian_scale": losses.laplacian(posed.log_scale, neighbours, same * weights.laplacian_scale),
+            "laplacian_color": losses.laplacian(colors, neighbours, same * weights.laplacian_color),
             **self._scale_terms(posed, weights),
             **self._color_terms(colors, weights),
         }
         if posed.pose_offset is not None:
             moved = decoded.offset + posed.pose_offset
-            terms["laplacian_pose_offset"] = losses.laplacian(moved, neighbours, weights.laplacian_offset)
+            weight = same * weights.laplacian_offset
+            terms["laplacian_pose_offset"] = losses.laplacian(moved, neighbours, weight)
             terms["pose_offset"] = settings.pose_offset * losses.size(posed.pose_offset)
         if posed.color_residual is not None:
             terms["residual_size"] = settings.residual_size * losses.size(posed.color_residual)
@@ -117,6 +119,24 @@ class Regularisers:
         if self._last is None or self._last[0] is not surface:
             self._last = surface, part_weights(surface.canonical, self.settings)
         return self._last[1]
+
+
+def unmixed(rows: Tensor, neighbours: SparsePair, count: int) -> Tensor:
+    """Where smoothness can be told: 1 where a vertex and all its neighbours are of one kind, else 0.
+
+    The pose heads are asked for some vertices only. At the border of these, what is posed lies beside what
+    is not, and a difference between the two says nothing of how smooth either is.
+
+    Args:
+        rows: [M] int64, the vertices asked for.
+        neighbours: [N, N], the mean over each vertex's neighbours.
+        count: N.
+
+    Returns:
+        [N, 1] float32.
+    """
+    inside = torch.zeros(count, 1).index_fill_(0, rows, 1.0)
+    return ((neighbours @ inside - inside).abs() < 1e-3).float()
 
 
 def part_weights(canonical: Canonical, settings: TrainSettings) -> PartWeights:

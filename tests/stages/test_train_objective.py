@@ -113,11 +113,40 @@ def test_pictures_reach_every_head(objective):
 
 
 def test_lpips_of_every_kth_draw_has_k_times_the_weight(objective):
-    every, third = objective(lpips=0.2, lpips_every=1), objective(lpips=0.2, lpips_every=3)
+    # The two have drawn other frames before, and what was seen then must not matter here.
+    whole = {"lpips": 0.2, "pose_seen_only": False}
+    every, third = objective(lpips_every=1, **whole), objective(lpips_every=3, **whole)
     assert ["lpips" in third(iteration, 0, False) for iteration in range(4)] == [True, False, False, True]
     for position in (0, 3):
         one, other = (float(each(position, 0, False)["lpips"].detach()) for each in (every, third))
         assert one > 0 and other == pytest.approx(3 * one)
+
+
+def test_second_draw_of_a_frame_poses_what_the_first_one_showed(objective):
+    made, whole = objective(face=0.0), objective(face=0.0, pose_seen_only=False)
+    frame, count = made.draw(0).frame, len(made.avatar)
+    assert made.sight.rows(frame, 0, count) is None  # and so the first draw poses all
+    first, expected = (terms(0, 0, False) for terms in (made, whole))
+    assert all(torch.equal(first[name], expected[name]) for name in expected)
+    rows = made.sight.rows(frame, 0, count)
+    assert 0 < len(rows) < count
+    assert made.sight.rows(frame, 1, count) is None  # another level has other Gaussians
+    again = made(0, 0, False)
+    torch.testing.assert_close(again["l1"], expected["l1"], rtol=1e-3, atol=1e-6)
+    assert 0 < again["pose_offset"] < expected["pose_offset"]  # hidden ones are not asked for
+    assert torch.equal(whole(0, 0, False)["pose_offset"], expected["pose_offset"])
+
+
+def test_what_was_left_out_by_mistake_is_posed_again_at_the_next_draw(objective):
+    made = objective()
+    frame, count = made.draw(0).frame, len(made.avatar)
+    made(0, 0, False)
+    right = made.sight.rows(frame, 0, count)
+    made.sight.note(frame, 0, torch.zeros(count))
+    assert len(made.sight.rows(frame, 0, count)) == 0
+    assert all(bool(term.isfinite()) for term in made(0, 0, False).values())
+    found = made.sight.rows(frame, 0, count)
+    assert len(set(found.tolist()) ^ set(right.tolist())) < 0.1 * len(right)
 
 
 def test_residual_heads_are_sometimes_told_no_time(objective):

@@ -17,6 +17,7 @@ from pipeline.errors import UserError
 from pipeline.splat import render
 from pipeline.threads import threads
 from pipeline.workspace import REPOSITORY
+from stages.evaluate.rendering import animator
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=16, groups=2, subdivisions=1)
 WITH_RESIDUALS = dataclasses.replace(SMALL, residual_parts=("face", "left_hand", "rest"), residual_width=8)
@@ -159,3 +160,11 @@ def test_normals_and_joints_are_those_of_the_body(body):
     joints, weights = joints_of_points(body.skinning_weights)
     dense = torch.zeros_like(body.skinning_weights).scatter_add_(1, joints.long(), weights)
     assert torch.equal(dense, body.skinning_weights)
+
+
+def test_evaluate_animates_the_baked_avatar_as_it_would_the_avatar(body):
+    avatar = an_avatar(body, WITH_RESIDUALS)
+    with torch.no_grad():
+        expected = avatar.gaussians(*a_pose(), 1.3).tensors()
+    for mine, theirs in zip(animator(avatar)(*a_pose(), 1.3).tensors(), expected, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)

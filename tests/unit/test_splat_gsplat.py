@@ -1,6 +1,7 @@
 """The gsplat backend, with a stand-in for gsplat: no test machine has a GPU."""
 
 import inspect
+import shutil
 import sys
 import types
 
@@ -69,6 +70,33 @@ def test_nothing_usable_is_an_empty_image(gsplat):
 def test_without_gsplat_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(UserError, match="gsplat"):
+        render_gsplat(*scene(5, 8, 8, torch.float32))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        AttributeError("'NoneType' object has no attribute 'projection'"),
+        ImportError("gsplat_cuda.so: cannot open shared object file"),
+        RuntimeError("Ninja is required to load C++ extensions"),
+    ],
+)
+def test_a_build_that_failed_names_the_tools_that_are_missing(monkeypatch, error):
+    def fails(**_):
+        raise error
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=fails))
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/g++" if name == "g++" else None)
+    with pytest.raises(UserError, match="this machine lacks nvcc, ninja"):
+        render_gsplat(*scene(5, 8, 8, torch.float32))
+
+
+def test_another_error_of_gsplat_is_not_taken_for_a_build_that_failed(monkeypatch):
+    def fails(**_):
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=fails))
+    with pytest.raises(RuntimeError, match="out of memory"):
         render_gsplat(*scene(5, 8, 8, torch.float32))
 
 

@@ -67,12 +67,12 @@ def test_straightforward_gradients_are_ours_also_over_several_frames(pair):
         assert (mine - theirs).norm() < 1e-2 * theirs.norm(), name
 
 
-def test_decoding_only_what_is_seen_changes_neither_picture_nor_what_it_teaches(pair):
+def test_posing_only_what_is_seen_changes_neither_picture_nor_what_it_teaches(pair):
     avatar, plain = pair
     ours = step.Contestant("seen", avatar, step._adam(avatar, fused=True), shared=True, seen=True)
     theirs = step.Contestant("plain", plain, step._adam(plain, fused=False), shared=False)
     frames = step.frames_of(avatar, 2, 48)
-    assert not frames[0].seen.all() and frames[0].inner.sum() < frames[0].seen.sum()
+    assert 0 < len(frames[0].seen) < len(avatar)
     image, gradient = step.difference(ours, theirs, frames)
     assert image < 1e-5 and gradient < 1e-2
 

@@ -1,0 +1,69 @@
+"""What each training frame saw of the avatar when it was last drawn.
+
+The pose heads work for one frame at a time, and a Gaussian that the frame does not see gets no gradient from
+it. So they are asked only for what the frame saw the last time. Every Gaussian is drawn all the same, with
+its static part alone if need be: one that comes into sight is noticed at once, and has its pose-dependent
+part back when the frame is drawn next.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+UNKNOWN = -1
+
+
+class Sight(nn.Module):
+    """A bit a Gaussian and training frame. Its buffers belong to what a resumed run needs.
+
+    Attributes:
+        bits: [F, N / 8] uint8, what the frames saw, N being the finest level's number of Gaussians.
+        levels: [F] int8, the level of subdivision that this is about, or UNKNOWN.
+    """
+
+    bits: Tensor  # [F, N / 8]
+    levels: Tensor  # [F]
+
+    def __init__(self, frames: tuple[int, ...], count: int):
+        """Nothing is known yet.
+
+        Args:
+            frames: the numbers of the training frames.
+            count: Gaussians of the finest level.
+        """
+        super().__init__()
+        self._places = {frame: place for place, frame in enumerate(frames)}
+        self.register_buffer("bits", torch.zeros(len(frames), -(-count // 8), dtype=torch.uint8))
+        self.register_buffer("levels", torch.full((len(frames),), UNKNOWN, dtype=torch.int8))
+
+    def rows(self, frame: int, level: int, count: int, kept: Tensor | None = None) -> Tensor | None:
+        """The Gaussians that a frame saw, [M] int64; None if it was not drawn on this level yet.
+
+        Args:
+            frame: its number.
+            level: of subdivision.
+            count: Gaussians of this level that the gate leaves.
+            kept: [count] int64, which of the level's these are; the first ``count`` if None.
+        """
+        place = self._places[frame]
+        if int(self.levels[place]) != level:
+            return None
+        bits = self.bits[place, :, None] >> torch.arange(8, dtype=torch.uint8)
+        seen = (bits & 1).flatten()
+        return torch.nonzero(seen[:count] if kept is None else seen[kept])[:, 0]
+
+    def note(self, frame: int, level: int, weights: Tensor, kept: Tensor | None = None) -> None:
+        """Keeps what a frame has seen; what the gate took away counts as unseen.
+
+        Args:
+            frame: its number.
+            level: of subdivision.
+            weights: [N], each Gaussian's summed blending weight.
+            kept: as for ``rows``.
+        """
+        place, seen = self._places[frame], torch.zeros(8 * self.bits.shape[1], dtype=torch.uint8)
+        seen[torch.arange(len(weights)) if kept is None else kept] = (weights > 0).to(torch.uint8)
+        powers = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8)
+        self.bits[place] = (seen.view(-1, 8) * powers).sum(1, dtype=torch.uint8)
+        self.levels[place] = level
