@@ -15,6 +15,7 @@ from pipeline.camera import Camera
 from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
+from pipeline.threads import threads
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
@@ -50,6 +51,7 @@ class Registration:
     seconds: tuple[tuple[int, float], ...]
 
 
+@threads(1)  # sums of many threads differ in their last digits, also those before and after the solver
 def register(
     body: BodyModel,
     landmarks: Landmarks,
