@@ -1,6 +1,6 @@
 """What the registration is worth and what it costs: ``python -m benchmarks.fit [--quick] [--json FILE]``.
 
-Three tables:
+Three tables, of which ``--detectors``, ``--framings``, ``--variants`` and ``--no-effort`` choose a part:
 
 - errors against the truth of mannequins in each framing (see ``fit_truth.py``), for the fit as it is and for
   fits that lack one thing each. ``tau = 0`` trusts every score but still masks what lies outside the
@@ -95,27 +95,29 @@ def main(arguments: list[str] | None = None) -> None:
     stage = load_stage()
     quick = options.quick
     print(f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}")
-    detectors = tuple(options.detectors)
-    clips = {framing: list(_clips(framing, stage, detectors, quick, options.bvh)) for framing in FRAMINGS}
+    detectors, framings = tuple(options.detectors), tuple(options.framings)
+    clips = {framing: list(_clips(framing, stage, detectors, quick, options.bvh)) for framing in framings}
 
     runs: list[Run] = []
     for detector in detectors:
-        for framing in FRAMINGS:
+        for framing in framings:
             chosen = [clip for clip in clips[framing] if clip.detector == detector]
-            for line in _error_table(chosen, stage, runs, QUICK_ITERATIONS if quick else None):
+            iterations = QUICK_ITERATIONS if quick else None
+            for line in _error_table(chosen, stage, runs, options.variants, iterations):
                 print(line, flush=True)
     cost = posing_cost(stage, 4 if quick else _POSED_FRAMES)
     print(f"\nposing, forward and backward: landmarks {cost[0]:.1f} ms, whole mesh {cost[1]:.1f} ms")
     effort: list[Run] = []
-    first = [clips[framing][0] for framing in FRAMINGS]
-    for line in _effort_table(first, stage, QUICK_EFFORTS if quick else EFFORTS, effort):
-        print(line, flush=True)
+    if not options.no_effort:
+        first = [clips[framing][0] for framing in framings]
+        for line in _effort_table(first, stage, QUICK_EFFORTS if quick else EFFORTS, effort):
+            print(line, flush=True)
     if options.json is not None:
         record = {"errors": runs, "effort": effort}
         lists = {name: [dataclasses.asdict(run) for run in many] for name, many in record.items()}
         posing = {"landmarks_ms": cost[0], "mesh_ms": cost[1]}
         options.json.write_text(json.dumps({**lists, "posing": posing}, indent=1) + "\n")
-    if options.figure is not None:
+    if options.figure is not None and effort:
         draw_effort(effort, options.figure)
     print(headline(runs, cost))
 
@@ -133,6 +135,15 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--detectors", nargs="+", choices=SOURCES, help="whose errors the keypoints have (all of them)"
     )
+    parser.add_argument("--framings", nargs="+", choices=FRAMINGS, default=FRAMINGS, help="all of them")
+    parser.add_argument(
+        "--variants",
+        nargs="+",
+        choices=VARIANTS,
+        default=list(VARIANTS),
+        help="rows of the error tables (all)",
+    )
+    parser.add_argument("--no-effort", action="store_true", help="leave out error against seconds")
     options = parser.parse_args(arguments)
     options.detectors = options.detectors or (SOURCES[:1] if options.quick else SOURCES)
     return options
@@ -171,9 +182,9 @@ def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
 
 
 def _error_table(
-    clips: list[Clip], stage: Stage, runs: list[Run], iterations: int | None = None
+    clips: list[Clip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
 ) -> Iterator[str]:
-    """Fit the clips of one framing and detector in every variant; append the runs, yield lines."""
+    """Fit the clips of one framing and detector in each variant; append the runs, yield lines."""
     base = FitSettings() if iterations is None else FitSettings(iterations=iterations)
     framing, detector = clips[0].spec.framing, clips[0].detector
     yield (
@@ -182,8 +193,8 @@ def _error_table(
         f"{clips[0].spec.size}"
     )
     yield _row("", *COLUMNS, "s/100 fr.")
-    for variant, changes in VARIANTS.items():
-        settings = dataclasses.replace(base, **changes)
+    for variant in variants:
+        settings = dataclasses.replace(base, **VARIANTS[variant])
         many = [fit(clip, stage, variant, settings) for clip in clips]
         runs.extend(many)
         yield _row(variant, *_cells(many))
@@ -278,22 +289,24 @@ def headline(runs: list[Run], cost: tuple[float, float]) -> str:
     parts = []
     for detector in dict.fromkeys(run.detector for run in runs):
         ratios = []
-        for framing in FRAMINGS:
-            error = {
-                variant: statistics.mean(
-                    run.errors.joints
-                    for run in runs
-                    if (run.detector, run.framing, run.variant) == (detector, framing, variant)
+        for framing in dict.fromkeys(run.framing for run in runs):
+            masked, tau, none = (
+                _mean_joints(
+                    [r for r in runs if (r.detector, r.framing, r.variant) == (detector, framing, v)]
                 )
-                for variant in (MASKED, "tau = 0", "no mask")
-            }
-            tau, none = (error[variant] / error[MASKED] for variant in ("tau = 0", "no mask"))
-            ratios.append(f"{framing} {tau:.2f} and {none:.2f}")
+                for v in (MASKED, "tau = 0", "no mask")
+            )
+            ratios.append(f"{framing} {tau / masked:.2f} and {none / masked:.2f}")
         parts.append(f"{detector}: {', '.join(ratios)}")
     return (
         f"fit: error of seen joints at tau = 0 and without mask, times that of the mask; {'; '.join(parts)}; "
         f"posing landmarks costs {cost[0] / cost[1]:.3f} of the mesh"
     )
+
+
+def _mean_joints(runs: list[Run]) -> float:
+    """The mean error of seen joints; NaN if there is no such run."""
+    return statistics.mean(run.errors.joints for run in runs) if runs else float("nan")
 
 
 def _cells(runs: list[Run]) -> list[str]:

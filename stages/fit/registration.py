@@ -16,6 +16,7 @@ from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
+from pipeline.threads import threads
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
@@ -53,6 +54,7 @@ class Registration:
     face_frames: int = 0
 
 
+@threads(1)  # sums of many threads differ in their last digits, also those before and after the solver
 def register(
     body: BodyModel,
     landmarks: Landmarks,

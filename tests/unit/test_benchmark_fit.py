@@ -157,3 +157,11 @@ def test_tables_headline_and_files(monkeypatch, capsys, tmp_path, stage, clip):
     assert len(record["errors"]) == 3 * len(fit.VARIANTS)
     assert {run["iterations"] for run in record["effort"]} == {*fit.QUICK_EFFORTS, fit.STEPS}
     assert figure.read_bytes().startswith(b"\x89PNG")
+
+    few = ["--quick", "--framings", "upper", "--variants", fit.MASKED, "tau = 0", "--no-effort"]
+    fit.main([*few, "--json", str(table)])
+    record = json.loads(table.read_text())
+    assert [(run["framing"], run["variant"]) for run in record["errors"]] == [
+        ("upper", fit.MASKED), ("upper", "tau = 0")
+    ]  # fmt: skip
+    assert not record["effort"] and "upper 2.00 and nan" in capsys.readouterr().out
