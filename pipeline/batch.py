@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import socket
 import sys
 import tempfile
 import time
@@ -105,7 +106,7 @@ def run_batch(subjects: Sequence[str], words: Mapping[str, str]) -> list[Outcome
         UserError: Ray is not installed, there is no such cluster, it cannot give what the preset asks
             for, or an asset cannot be fetched.
     """
-    ray = import_ray()
+    ray = import_ray(words.get("cluster", "auto"))
     carried = shared_words(words)
     fetch_assets(subjects, carried)
     with connected(ray, words.get("cluster", "auto")):
@@ -122,8 +123,24 @@ def run_batch(subjects: Sequence[str], words: Mapping[str, str]) -> list[Outcome
     return ordered
 
 
-def import_ray() -> Any:
-    """Ray, told to be quiet; UserError where it is not installed."""
+def on_loopback(cluster: str) -> bool:
+    """Whether the cluster is this machine's own, which is only reached through the loopback interface."""
+    address = cluster
+    if cluster == "auto":
+        known = Path(os.environ.get("RAY_TMPDIR", "/tmp")) / "ray" / "ray_current_cluster"
+        address = os.environ.get("RAY_ADDRESS") or (known.read_text() if known.is_file() else "local")
+    host = address.removeprefix("ray://").rpartition(":")[0]
+    return address == "local" or host in ("localhost", LOCAL, "[::1]")
+
+
+def import_ray(cluster: str) -> Any:
+    """Ray, told to be quiet, and to stay on the loopback interface where the cluster is there.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    if on_loopback(cluster):  # else Ray takes 127.0.0.1 for the machine's address in the network
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     # Ray leaves out lines that several subjects print; here every subject's lines count.
     os.environ.setdefault("RAY_DEDUP_LOGS", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -181,20 +198,32 @@ def connected(ray: Any, cluster: str) -> Iterator[None]:
             try:
                 ray.init(address="local", include_dashboard=False, _node_ip_address=LOCAL, **options)
             except Exception as error:  # Ray raises bare exceptions
-                raise UserError(f"cluster={cluster}: Ray does not start here ({first_line(error)})") from error
+                raise UserError(
+                    f"cluster={cluster}: Ray does not start here ({first_line(error)})"
+                ) from error
         yield
 
 
 def joined(ray: Any, address: str, options: Mapping[str, Any]) -> bool:
     """Whether this process is part of the cluster now; false where ``auto`` finds none."""
     try:
+        if address != "auto":
+            answer(address)
         ray.init(address=address, **options)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         if address != "auto":
             raise UserError(f"cluster={address}: there is no Ray cluster ({first_line(error)})") from None
         print("batch: no Ray cluster runs here, so a local one is started", flush=True)
         return False
     return True
+
+
+def answer(address: str) -> None:
+    """Raises an error where nothing listens at HOST:PORT: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdigit():
+        raise ValueError("an address is HOST:PORT")
+    socket.create_connection((host, int(port)), timeout=10).close()
 
 
 @contextlib.contextmanager

@@ -105,7 +105,10 @@ def with_mean(values: Mapping[str, Values], subjects: Sequence[str]) -> dict[str
     known = [values[subject] for subject in subjects if subject in values]
     if MEAN in values or len(known) < len(subjects):
         return dict(values)
-    return {**values, MEAN: tuple(average([value[place] for value in known]) for place in range(len(METRICS)))}
+    return {
+        **values,
+        MEAN: tuple(average([value[place] for value in known]) for place in range(len(METRICS))),
+    }
 
 
 def line(name: str, values: Mapping[str, Values], columns: Sequence[str]) -> str:
