@@ -55,12 +55,16 @@ def test_a_node_is_lost_and_its_subjects_go_on_elsewhere(six):
             words = ["dataset=six", f"cluster={cluster.address}", *six.words()]
             batch = subprocess.Popen(
                 [sys.executable, "-m", "doit", "run", "batch", *words],
-                cwd=REPOSITORY, env=six.environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                cwd=REPOSITORY, env=six.environment(),
+                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             )  # fmt: skip
-            wait_until_all_paint(six, batch)
-            before = lines(six.data / "ran.log")
-            cluster.remove_node(others[-1], allow_graceful=False)
-            said, _ = batch.communicate(timeout=200)
+            try:
+                wait_until_all_paint(six, batch)
+                before = lines(six.data / "ran.log")
+                cluster.remove_node(others[-1], allow_graceful=False)
+                said, _ = batch.communicate(timeout=200)
+            finally:
+                batch.kill()
         finally:
             cluster.shutdown()
     assert batch.returncode == 0, said
