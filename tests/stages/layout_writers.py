@@ -1,4 +1,4 @@
-"""Small folders in the layouts of datasets, written from the mannequin as peers.md describes them.
+"""Small folders in the layouts of datasets, written from the mannequin as their projects describe them.
 
 Nothing here is imported from ``stages.ingest.datasets``: what is written follows the datasets' conventions,
 and a reader that misunderstands one shows the body beside the picture.
