@@ -6,6 +6,9 @@
     doit run subject=me source=clip.mp4         any clip
     doit run subject=smile preset=balanced train.iterations=2000
     doit run -n 2 -P thread subject=smile,carphone
+    doit run dataset=insta                      every subject of a dataset
+    doit run compare dataset=insta              the paper's table, with what was measured here
+    doit run batch dataset=insta cluster=auto   the same on a Ray cluster
 
 What is stale is decided by the store (``pipeline.job``), never by doit's own database, which may be lost.
 """
@@ -14,17 +17,19 @@ from __future__ import annotations
 
 import functools
 import shutil
-import subprocess
 import sys
 
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
 from pipeline import assets as third_party
 from pipeline.artifact import Store, verify
+from pipeline.datasets import known_datasets, subjects_of
 from pipeline.errors import UserError
 from pipeline.job import Job, check_command_line, job_from_words, shown, workspace_from_words
-from pipeline.stage import load_stages, process_environment
+from pipeline.process import run_stage_process
+from pipeline.stage import load_stages
 from pipeline.subjects import known_subjects, load_subject
+from pipeline.summary import summarising
 
 DEFAULT_SUBJECT = "smile"
 
@@ -35,16 +40,29 @@ def command_line_words() -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
+def datasets(words: dict[str, str]) -> tuple[str, ...]:
+    """The datasets that ``dataset=`` names."""
+    return tuple(name for name in words.get("dataset", "").split(",") if name)
+
+
+def chosen_subjects(words: dict[str, str]) -> tuple[str, ...]:
+    """The subjects that the command line is about."""
+    if "subject" in words or not datasets(words):
+        return tuple(name for name in words.get("subject", DEFAULT_SUBJECT).split(",") if name)
+    workspace = workspace_from_words(words)
+    return tuple(dict.fromkeys(one for name in datasets(words) for one in subjects_of(workspace, name)))
+
+
 def checked_words() -> dict[str, str]:
     """The words, refused with one line if a name or a value is wrong."""
     words = command_line_words()
     try:
         check_command_line(words)
-        if "source" in words and "," in words.get("subject", ""):
+        chosen = chosen_subjects(words)
+        if "source" in words and len(chosen) > 1:
             raise UserError("source= names the footage of one subject; run the subjects one by one")
-        for subject in words.get("subject", "").split(","):
-            if subject:
-                load_subject(workspace_from_words(words), subject, words.get("source"))
+        for subject in chosen if "subject" in words else ():
+            load_subject(workspace_from_words(words), subject, words.get("source"), words.get("dataset"))
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return words
@@ -53,7 +71,7 @@ def checked_words() -> dict[str, str]:
 WORDS = checked_words()
 WORKSPACE = workspace_from_words(WORDS)
 STAGES = load_stages(WORKSPACE.stages)
-CHOSEN = tuple(name for name in WORDS.get("subject", DEFAULT_SUBJECT).split(",") if name)
+CHOSEN = chosen_subjects(WORDS)
 SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN}))
 LAST = list(STAGES)[-1]
 
@@ -62,14 +80,19 @@ DOIT_CONFIG = {
     "backend": "json",
     "dep_file": str(WORKSPACE.data.parent / ".doit.json"),
     "verbosity": 2,
+    "reporter": summarising(CHOSEN, list(STAGES)),
     "continue": True,
     "action_string_formatting": "new",
 }
 
 
 def words_of(subject: str) -> dict[str, str]:
-    """The words that concern a subject: footage on the command line is that of the chosen one."""
-    return {name: value for name, value in WORDS.items() if name != "source" or subject in CHOSEN}
+    """The words that concern a subject: footage and dataset on the command line are the chosen one's.
+
+    Without ``subject=``, ``dataset=`` says which subjects; what each is part of its own file says.
+    """
+    own = ("source", "dataset") if subject not in CHOSEN or "subject" not in WORDS else ()
+    return {name: value for name, value in WORDS.items() if name not in own}
 
 
 @functools.cache
@@ -88,25 +111,16 @@ def is_current(stage: str, subject: str) -> bool:
 
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself."""
-    words = [f"{name}={value}" for name, value in words_of(subject).items() if name != "subject"]
-    command = [sys.executable, "-m", "pipeline.stage", stage, "--subject", subject, *words]
-    status = subprocess.run(command, env=process_environment(), check=False).returncode
-    if status < 0:
-        return TaskFailed(
-            f"{stage}:{subject} was killed by signal {-status}; the same command goes on from here"
-        )
-    return TaskFailed(f"{stage}:{subject} stopped; its own line above says why") if status else None
+    reason = run_stage_process(stage, subject, words_of(subject))
+    return TaskFailed(reason) if reason else None
 
 
 def needed_assets(stage: str, subject: str) -> list[str]:
     """The assets that a stage needs under the subject's settings, its footage's included."""
     try:
-        job = job_of(subject)
+        return job_of(subject).needed_assets(stage)
     except UserError:
         return []  # the stage itself reports it
-    demands = STAGES[stage].demands(job.settings[stage])
-    footage = [job.subject.asset] if demands.source and job.subject.asset else []
-    return [*demands.assets, *footage]
 
 
 def remove_versions(stage: str, subject: str) -> None:
@@ -203,3 +217,41 @@ def task_prune():
             "doc": f"keep only {subject}'s latest versions",
             "actions": [(prune_subject, [subject])],
         }
+
+
+def compare_datasets() -> TaskFailed | None:
+    """Makes the tables of the chosen datasets."""
+    from pipeline.compare import compare
+
+    names = datasets(WORDS)
+    if not names:
+        known = ", ".join(known_datasets(WORKSPACE))
+        return TaskFailed(f"compare needs a dataset: doit run compare dataset=NAME; there are {known}")
+    try:
+        for name in names:
+            compare(name, WORDS)
+    except UserError as error:
+        return TaskFailed(str(error))
+    return None
+
+
+def task_compare():
+    """The paper's table of a dataset, with what was measured here beside it."""
+    return {"actions": [(compare_datasets, [])]}
+
+
+def batch_subjects() -> TaskFailed | None:
+    """Runs the chosen subjects on a Ray cluster."""
+    from pipeline.batch import run_batch
+
+    try:
+        outcomes = run_batch(CHOSEN, WORDS)
+    except (UserError, OSError) as error:
+        return TaskFailed(str(error))
+    failed = [one.subject for one in outcomes if one.stage]
+    return TaskFailed(f"failed: {', '.join(failed)}") if failed else None
+
+
+def task_batch():
+    """Many subjects at once on a Ray cluster: cluster=auto, local or an address."""
+    return {"actions": [(batch_subjects, [])]}

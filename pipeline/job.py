@@ -24,7 +24,8 @@ from pipeline.workspace import Workspace, open_workspace
 
 # Words of the command line that are no stage's settings.
 PLACES = ("data", "artifacts", "assets", "body", "stages")
-WORDS = ("subject", "preset", "source", *PLACES)
+WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", *PLACES)
+NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
 DEFAULT_PRESET = "quick"
 
 Found = dict[str, Artifact | None]
@@ -124,6 +125,12 @@ class Job:
             self.store.select(artifact)
         return artifact is not None
 
+    def needed_assets(self, name: str) -> list[str]:
+        """The assets that a stage needs, its footage's included."""
+        demands = self.stages[name].demands(self.settings[name])
+        footage = [self.subject.asset] if demands.source and self.subject.asset else []
+        return [*demands.assets, *footage]
+
 
 def key_of(description: Mapping[str, Any]) -> str:
     """The key of a version: a digest of what it is made from."""
@@ -163,14 +170,20 @@ def preset_layer(workspace: Workspace, name: str) -> Layer:
     Raises:
         UserError: there is no such preset; shows which there are.
     """
+    path = preset_path(workspace, name)
+    tables = {key: value for key, value in read_toml(path).items() if key not in NOT_SETTINGS}
+    return Layer(str(path), tables)
+
+
+def preset_path(workspace: Workspace, name: str) -> Path:
+    """A preset's file; UserError where there is none."""
     path = workspace.data / "presets" / f"{name}.toml"
     if not path.is_file():
         known = sorted(file.stem for file in (workspace.data / "presets").glob("*.toml"))
         raise UserError(
             f"preset={name}: there is no such preset; there are {', '.join(known)}{near(name, known)}"
         )
-    tables = {key: value for key, value in read_toml(path).items() if key != "title"}
-    return Layer(str(path), tables)
+    return path
 
 
 def setting_layers(workspace: Workspace, words: Mapping[str, str], subject: Subject | None) -> list[Layer]:
@@ -206,7 +219,7 @@ def job_from_words(subject: str, words: Mapping[str, str]) -> Job:
     workspace = workspace_from_words(words)
     stages = load_stages(workspace.stages)
     check_words(words, stages)
-    who = load_subject(workspace, subject, words.get("source"))
+    who = load_subject(workspace, subject, words.get("source"), words.get("dataset"))
     settings = resolve(
         {name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, who)
     )

@@ -252,11 +252,23 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except Exception as error:
         message = explain(error, where)
+        leave_reason(message or f"{type(error).__name__}: {error} (a defect; its traceback is above)")
         if message is None:
             raise
         print(f"{options.stage}:{options.subject} failed: {message}", file=sys.stderr, flush=True)
         return 1
     return 0
+
+
+REASON = "FLEXIAVATAR_REASON"
+"""Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
+
+
+def leave_reason(message: str) -> None:
+    """Leaves the reason of a failure where the starter looks for it, if there is one."""
+    if os.environ.get(REASON):
+        with contextlib.suppress(OSError):
+            Path(os.environ[REASON]).write_text(message, encoding="utf-8")
 
 
 def process_environment() -> dict[str, str]:

@@ -3,7 +3,7 @@
 A subject is one file, ``data/subjects/<name>.toml``::
 
     title = "A man, head and shoulders"
-    dataset = "samples"             # optional: settings shared by a dataset
+    dataset = "samples"             # optional: one of data/datasets, for settings that its subjects share
     [source]
     asset = "smile"                 # footage that assets.toml can fetch ...
     file = "single_face.mp4"
@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.datasets import load_dataset
 from pipeline.errors import UserError
 from pipeline.settings import Layer, near, read_toml
 from pipeline.workspace import Workspace
@@ -56,11 +57,14 @@ def known_subjects(workspace: Workspace) -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (workspace.data / "subjects").glob("*.toml")))
 
 
-def load_subject(workspace: Workspace, name: str, source: str | None = None) -> Subject:
+def load_subject(
+    workspace: Workspace, name: str, source: str | None = None, dataset: str | None = None
+) -> Subject:
     """Reads a subject's file, if it has one.
 
     Args:
         source: the command line's footage, which replaces the file's.
+        dataset: the command line's dataset, which replaces the file's.
 
     Raises:
         UserError: no such subject, or its file is wrong.
@@ -74,8 +78,10 @@ def load_subject(workspace: Workspace, name: str, source: str | None = None) -> 
                 f"subject={name}: there is no {path} and no footage; name a clip: "
                 f"doit run subject={name} source=CLIP.mp4{near(name, known_subjects(workspace))}"
             )
-        return Subject(name, name, None, Path(source).absolute(), "", ())
-    return parse_subject(workspace, path, read_toml(path), source)
+        layers = (load_dataset(workspace, dataset).layer,) if dataset else ()
+        return Subject(name, name, None, Path(source).absolute(), "", layers)
+    content = read_toml(path)
+    return parse_subject(workspace, path, {**content, "dataset": dataset} if dataset else content, source)
 
 
 def parse_subject(
@@ -89,18 +95,18 @@ def parse_subject(
         raise UserError(
             f"{path}: [source] takes 'asset' and 'file', or 'path' and 'obtain', not {sorted(unknown)}"
         )
-    layers = [Layer(str(path), tables)]
+    layers, obtain = [Layer(str(path), tables)], str(footage.get("obtain", ""))
     if "dataset" in content:
-        dataset = workspace.data / "datasets" / f"{content['dataset']}.toml"
-        shared = {name: value for name, value in read_toml(dataset).items() if name != "title"}
-        layers.insert(0, Layer(str(dataset), shared))
+        dataset = load_dataset(workspace, str(content["dataset"]))
+        layers.insert(0, dataset.layer)
+        obtain = obtain or dataset.obtain
     asset = footage.get("asset") if source is None else None
     return Subject(
         name=path.stem,
         title=str(content.get("title", path.stem)),
         asset=asset,
         source=find_footage(workspace, footage, asset, source),
-        obtain=str(footage.get("obtain", "")),
+        obtain=obtain,
         layers=tuple(layers),
     )
 

@@ -26,7 +26,8 @@ def inside(folder: Path, name: str, origin: Path) -> Path:
     relative = PurePosixPath(str(name).replace("\\", "/"))
     shown = str(name)[:_SHOWN]
     remedy = "it may be made to harm: take it from its authors again"
-    if "\0" in str(name) or relative.is_absolute() or ".." in relative.parts or ":" in relative.parts[0:1]:
+    drive = bool(relative.parts) and ":" in relative.parts[0]
+    if "\0" in str(name) or drive or relative.is_absolute() or ".." in relative.parts:
         raise UserError(f"{origin} names '{shown}', which is outside of {folder}: {remedy}")
     path = folder / relative
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -50,7 +51,7 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         if size > most:
             raise UserError(f"{path} has {size >> 20} MB, more than the {most >> 20} MB allowed: {remedy}")
         with path.open("rb") as file:
-            return file.read(most)
+            return file.read(size)
     except FileNotFoundError:
         raise UserError(f"{path} is missing: {remedy}") from None
     except OSError as error:

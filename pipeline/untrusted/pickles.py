@@ -22,7 +22,7 @@ from pipeline.errors import UserError
 from pipeline.untrusted.paths import GIGABYTE, bounded_bytes
 
 MOST_OPCODES = 20_000_000
-MOST_VALUES = 5_000_000  # in one file, containers unrolled: shared ones count each time
+MOST_VALUES = 300_000  # in one file, containers unrolled: shared ones count each time
 MOST_DEPTH = 40
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")

@@ -55,8 +55,13 @@ def _tile(frames: Path, masks: Path, keypoints: Keypoints, row: int) -> np.ndarr
 
 
 def _grid(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    # Cameras of one rig may differ by some pixels.
+    height, width = (max(tile.shape[side] for tile in tiles) for side in (0, 1))
+    tiles = [
+        np.pad(tile, ((0, height - tile.shape[0]), (0, width - tile.shape[1]), (0, 0))) for tile in tiles
+    ]
     blank = np.zeros_like(tiles[0])
     padded = [*tiles, *[blank] * (-len(tiles) % min(columns, len(tiles)))]
-    width = min(columns, len(tiles))
-    rows = [np.concatenate(padded[at : at + width], axis=1) for at in range(0, len(padded), width)]
+    across = min(columns, len(tiles))
+    rows = [np.concatenate(padded[at : at + across], axis=1) for at in range(0, len(padded), across)]
     return np.concatenate(rows)

@@ -80,7 +80,9 @@ class Footage:
 def footage() -> Footage:
     """Film it; all tests share what comes out."""
     body = load_body(BODY_FILE)
-    spec = MannequinSpec("full", motion="turn+gesture+curl", frames=COUNT, size=SIZE, fps=8.0, noise=0.0)
+    spec = MannequinSpec(
+        "full", motion="turn+gesture+curl+speech", frames=COUNT, size=SIZE, fps=8.0, noise=0.0
+    )
     filming = Filming(spec, body, load_landmarks(body, BODY_FOLDER))
     points = filming.places.world[:, filming.places.sets["whole_body"]].double().numpy()
     first = filming.scene.shot.camera

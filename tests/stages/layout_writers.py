@@ -1,4 +1,4 @@
-"""Small folders in the layouts of datasets, written from the mannequin as peers.md describes them.
+"""Small folders in the layouts of datasets, written from the mannequin as their projects describe them.
 
 Nothing here is imported from ``stages.ingest.datasets``: what is written follows the datasets' conventions,
 and a reader that misunderstands one shows the body beside the picture.
@@ -152,7 +152,7 @@ def distorted(image: np.ndarray, matrix: np.ndarray, bend: np.ndarray, how: int)
 
 
 def zju(folder: Path, shown: Footage, bend: np.ndarray) -> Path:
-    """annots.npy with K, D, R and T in mm, a world whose Z is up, SMPL about the origin; every fifth frame."""
+    """annots.npy with K, D, R, T in mm, a world whose Z is up, SMPL about the origin; every fifth frame."""
     cams: dict[str, list] = {"K": [], "D": [], "R": [], "T": []}
     names = ["Camera_B1", "Camera_B2", "Camera_B3"]
     for take, name in zip(shown.rig, names, strict=True):
@@ -175,9 +175,10 @@ def zju(folder: Path, shown: Footage, bend: np.ndarray) -> Path:
     (folder / "smpl_params").mkdir()
     for row in range(len(shown.still.images)):
         turn = Z_UP @ shown.orient[row]
+        place = Z_UP @ shown.pelvis[row] - turn @ SMPL_ROOT
         value = {
-            "Rh": rotvec(turn).reshape(1, 3), "Th": (Z_UP @ shown.pelvis[row] - turn @ SMPL_ROOT).reshape(1, 3),
-            "shapes": np.zeros((1, 10)), "poses": smpl72(shown, row, np.zeros(3)).reshape(1, 72),
+            "Rh": rotvec(turn).reshape(1, 3), "Th": place.reshape(1, 3), "shapes": np.zeros((1, 10)),
+            "poses": smpl72(shown, row, np.zeros(3)).reshape(1, 72),
         }  # fmt: skip
         np.save(folder / "smpl_params" / f"{5 * row}.npy", value, allow_pickle=True)
     return folder

@@ -9,9 +9,10 @@
     smplx_optimized/body.json                        where ours: the digest of the body that was fitted
     smplx_init/12.json                               where nothing was fitted yet: the estimator's
 
-Source: peers.md A3. Roots are in the axes of the frame's camera and ``trans`` is relative to the root joint
-at rest (``pipeline.pose_files.axes``); hands are relative to the model's mean. ``locator_offset`` moves
-supervision only and is not read.
+Source: ExAvatar's fitting/ (mks0601/ExAvatar_RELEASE), whose layout FlexiAvatar's release keeps. Roots are
+in the axes of the frame's camera and ``trans`` is relative to the root joint at rest
+(``pipeline.pose_files.axes``); hands are relative to the model's mean. ``locator_offset`` moves supervision
+only and is not read.
 """
 
 from __future__ import annotations

@@ -9,12 +9,13 @@
     {train,val,test}_split.txt           lines such as 00012.png
     keypoints_whole_body/12.json, smplx_init/, smplx_optimized/    where prepared, see ``prepared``
 
-Source: peers.md A3 and B. Conversions: segmentations are inverted. COLMAP's unit is arbitrary, so metres come
-from ``ingest.camera_scale``, or from the person (``cameras.scale``). Of fitted poses the unsmoothed
-ones are read, as the authors do for NeuMan. Without the split files the official rule is applied:
-v = n // 5 validation frames at most, every int(n / v)-th from half of that on; the first half of them is the
-test set, the second the validation set, the rest is learnt from. Validation frames are in neither part here.
-ROMP's poses (``smpl_output_romp.pkl``), depth and DensePose are not read.
+Source: apple/ml-neuman (data_io/neuman_helper.py) and the releases of ExAvatar and FlexiAvatar.
+Conversions: segmentations are inverted. COLMAP's unit is arbitrary, so metres come from
+``ingest.camera_scale``, or from the person (``cameras.scale``). Of fitted poses the unsmoothed ones are
+read, as the authors do for NeuMan. Without the split files the official rule is applied: v = n // 5
+validation frames at most, every int(n / v)-th from half of that on; the first half of them is the test set,
+the second the validation set, the rest is learnt from. Validation frames are in neither part here. ROMP's
+poses (``smpl_output_romp.pkl``), depth and DensePose are not read.
 """
 
 from __future__ import annotations

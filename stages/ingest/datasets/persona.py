@@ -6,10 +6,10 @@
                                                     keypoints_whole_body/, smplx_optimized/smplx_params/,
                                                     frame_idx_list.txt
 
-The source is ``data/subjects/<name>``. Source: peers.md B (PERSONA ingest). The captured clip is learnt
-from and the test clip is held out; without one the captured clip's end is. Generated clips are another
-motion's poses painted with this person: they are no footage and are left for the auxiliary views. Names and
-conventions are those of ``prepared``.
+The source is ``data/subjects/<name>``. Source: PERSONA's release (mks0601/PERSONA_RELEASE). The captured
+clip is learnt from and the test clip is held out; without one the captured clip's end is. Generated clips
+are another motion's poses painted with this person: they are no footage and are left for the auxiliary
+views. Names and conventions are those of ``prepared``.
 """
 
 from __future__ import annotations

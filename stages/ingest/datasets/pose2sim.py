@@ -5,8 +5,8 @@
     videos/cam01.mp4, cam02.mp4, ...
     calibration/Calib*.toml or *.qca.txt    as many cameras, in the order of the videos' names
 
-Source: packages.md, peers.md B; the conversions are those of ``cameras.rig``: the world's Z axis points up
-there and Y here, Qualisys counts millimetres and 64ths of a pixel, and OpenCV half a pixel less.
+Source: the demo of the pose2sim package; the conversions are those of ``cameras.rig``: the world's Z axis
+points up there and Y here, Qualisys counts millimetres and 64ths of a pixel, and OpenCV half a pixel less.
 ``ingest.camera_name`` says which video is learnt from, by its name without suffix (the first if nothing is
 said), and ``ingest.test_cameras`` which ones are held out (``others``: all the rest). Cameras are numbered
 in the order of names where the calibration's own names differ from the videos'.

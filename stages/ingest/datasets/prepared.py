@@ -9,10 +9,11 @@
     smplx_init/, smplx_optimized/    see ``fitted``
     frame_list_{all,train,test}.txt  a number a line
 
-Source: peers.md A3, 0.2 and 0.5. FlexiAvatar's make_frame_list.py writes the same numbers into all three
-lists: a test list that is the training list holds nothing out, and then the clip's end is. A ``_gen``
-folder (generated views) has a training list only; its frames are all learnt from. No conversion is needed
-but that of the poses, which ``fitted`` states.
+Source: the releases of ExAvatar (mks0601/ExAvatar_RELEASE) and FlexiAvatar (yihalem1/FlexiAvatar_Release).
+FlexiAvatar's make_frame_list.py writes the same numbers into all three lists: a test list that is the
+training list holds nothing out, and then the clip's end is. A ``_gen`` folder (generated views) has a
+training list only; its frames are all learnt from. No conversion is needed but that of the poses, which
+``fitted`` states.
 """
 
 from __future__ import annotations

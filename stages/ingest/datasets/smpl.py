@@ -2,7 +2,7 @@
 
 SMPL has 24 joints, 3 numbers each, a rotation vector in radians relative to the parent. The root and the 21
 joints after it are SMPL-X's root and body joints in the same order; joints 22 and 23, the hands as one piece,
-have no counterpart and are left out (peers.md B; the SMPL and SMPL-X papers). Hands begin relaxed, jaw and
+have no counterpart and are left out (Loper et al. 2015, Pavlakos et al. 2019). Hands begin relaxed, jaw and
 eyes closed and straight. Both models rest in a T pose, so the rotations carry over; the shapes do not.
 
 The pelvis does: SMPL turns about its root joint J_0, which lies elsewhere in its model's axes than SMPL-X's

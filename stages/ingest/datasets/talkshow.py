@@ -6,13 +6,14 @@
     <seq>.pkl    SHOW's reconstruction; optional
 
 The source is the folder that holds both, or the clip alone; a .pkl elsewhere is ``ingest.poses=FILE``.
-Source: peers.md B. The pickle has numbers of each frame t (numpy arrays or torch tensors): global_orient
-[T, 1, 3], body_pose_axis [T, 63], jaw_pose, leye_pose, reye_pose [T, 3], left_hand_pose and right_hand_pose
-[T, 12], expression [T, 100], transl [T, 3], betas [1, 300]; and width, height, center, focal_length,
-camera_transl [3]. Conversions: the camera is SMPLify-X's, whose axes are OpenCV's and which does not turn,
-so a point of the body is at x + camera_transl in it, and trans = transl + camera_transl. The hands are 12
-coefficients of SMPL-X's hand components, added to the model's mean (flat_hand_mean is false): without the
-user's SMPL-X file (``body=``), whose components they need, they begin relaxed, and the fit says so.
+Source: SHOW and TalkSHOW (github.com/yhw-yhw). The pickle has numbers of each frame t (numpy arrays or
+torch tensors): global_orient [T, 1, 3], body_pose_axis [T, 63], jaw_pose, leye_pose, reye_pose [T, 3],
+left_hand_pose and right_hand_pose [T, 12], expression [T, 100], transl [T, 3], betas [1, 300]; and width,
+height, center, focal_length, camera_transl [3]. Conversions: the camera is SMPLify-X's, whose axes are
+OpenCV's and which does not turn, so a point of the body is at x + camera_transl in it, and trans = transl +
+camera_transl. The hands are 12 coefficients of SMPL-X's hand components, added to the model's mean
+(flat_hand_mean is false): without the user's SMPL-X file (``body=``), whose components they need, they
+begin relaxed, and the fit says so.
 """
 
 from __future__ import annotations

@@ -6,9 +6,10 @@
     images/<id>.png or .jpg
     masks/<id>.png or .jpg    white is the person
 
-Source: peers.md B. The poses are SMPL's and have no translation: the body turns about its root joint at the
-origin of its own axes, and the extrinsics (world-to-camera, OpenCV axes, metres) say where the camera is. So
-each frame has a camera of its own, and the world is the person's. Conversion of the 72 numbers: ``smpl``.
+Source: WildAvatar's release (zenodo 11526806) and its prepare_data. The poses are SMPL's and have no
+translation: the body turns about its root joint at the origin of its own axes, and the extrinsics
+(world-to-camera, OpenCV axes, metres) say where the camera is. So each frame has a camera of its own, and
+the world is the person's. Conversion of the 72 numbers: ``smpl``.
 """
 
 from __future__ import annotations

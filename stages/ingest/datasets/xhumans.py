@@ -7,7 +7,7 @@
     <id>/train/<Take>/render/keypoints_whole_body/12.json
     <id>/train/<Take>/SMPLX/*000012*.pkl
 
-The source is the take's folder. Source: peers.md A3, which names the files; ExAvatar's takes are 00028
+The source is the take's folder. Source: ExAvatar's reader, which names the files; ExAvatar's takes are 00028
 Take15, 00034 Take14, 00087 Take8. What is in the pickles it does not say; the names of the smplx package
 are read (global_orient, body_pose, jaw_pose, leye_pose, reye_pose, left_hand_pose, right_hand_pose,
 expression, betas, transl), and a file without them is refused. Conversions: extrinsics are world-to-camera

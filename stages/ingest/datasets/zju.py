@@ -7,11 +7,11 @@
     mask/<camera>/000123.png  not zero is the person
     smpl_params/123.npy       a pickled dictionary: Rh, Th, shapes, poses
 
-Source: peers.md B (GauHuman, GART). Conversions: T is millimetres. K and D are OpenCV's, which counts from
-the centre of the first pixel, so half a pixel is added; the distortion is taken out of the pictures.
-EasyMocap turns the posed body about the ORIGIN, x = R(Rh) x_posed + Th with the root's own rotation zero,
-so SMPL's root joint comes to be at R(Rh) J_0 + Th (``smpl`` says what J_0 is, and how 72 numbers become
-SMPL-X's).
+Source: the readers of GauHuman (scene/dataset_readers.py) and GART (lib_data/zju_mocap.py), and EasyMocap
+for Rh and Th. Conversions: T is millimetres. K and D are OpenCV's, which counts from the centre of the
+first pixel, so half a pixel is added; the distortion is taken out of the pictures. EasyMocap turns the
+posed body about the ORIGIN, x = R(Rh) x_posed + Th with the root's own rotation zero, so SMPL's root joint
+comes to be at R(Rh) J_0 + Th (``smpl`` says what J_0 is, and how 72 numbers become SMPL-X's).
 
 Read in two ways. As the paper and FlexiAvatar do: one camera as a video, ``ingest.camera_name`` says which
 by its number, 4 if nothing is said. As GauHuman does: ``ingest.test_cameras=others``, or numbers, holds out

@@ -1,0 +1,154 @@
+"""The paper's table of a dataset, with what was measured here beside it."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.artifact import Artifact, Store
+from pipeline.datasets import Dataset, load_dataset, subjects_of
+from pipeline.digest import write_atomically
+from pipeline.errors import UserError
+from pipeline.job import job_from_words, shown, workspace_from_words
+
+MEAN = "mean"
+METRICS = ("psnr", "ssim", "lpips_alex")
+OURS = {"avatar": "here", "nearest_frame": "here, nearest training frame"}
+Values = tuple[float | None, ...]
+
+
+def compare(dataset: str, words: Mapping[str, str]) -> Path:
+    """Prints the table of a dataset and writes it to ``artifacts/compare/<dataset>.md``.
+
+    Raises:
+        UserError: there is no such dataset, or a result of it is damaged.
+    """
+    workspace = workspace_from_words(words)
+    about = load_dataset(workspace, dataset)
+    subjects = subjects_of(workspace, dataset)
+    words = {name: value for name, value in words.items() if name not in ("dataset", "subject", "source")}
+    found = {subject: result_of(subject, words) for subject in subjects}
+    text = table(about, subjects, {subject: one[0] for subject, one in found.items()}, notes(about, found))
+    path = workspace.artifacts / "compare" / f"{dataset}.md"
+    write_atomically(path, text)
+    print(text)
+    print(f"written to {shown(path)}")
+    return path
+
+
+def result_of(subject: str, words: Mapping[str, str]) -> tuple[dict[str, Any] | None, bool]:
+    """A subject's ``summary.json``, and whether it is what these words would give.
+
+    The result under these words, else the one in use, else None.
+    """
+    job = job_from_words(subject, words)
+    last = list(job.stages)[-1]
+    try:
+        artifact = job.find(last)
+    except UserError:  # the footage is not here any more; the result may be
+        artifact = None
+    current = artifact is not None
+    artifact = artifact or Store(job.workspace.artifacts).latest(subject, last)
+    return (read_summary(artifact), current) if artifact else (None, False)
+
+
+def read_summary(artifact: Artifact) -> dict[str, Any]:
+    """What evaluate wrote; UserError where it is damaged."""
+    path = artifact.folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        return {"means": summary["means"]["test"], "protocol": str(summary.get("protocol", ""))}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
+
+
+def table(
+    about: Dataset,
+    subjects: Sequence[str],
+    found: Mapping[str, dict[str, Any] | None],
+    remarks: Sequence[str],
+) -> str:
+    """The table as Markdown.
+
+    Args:
+        about: the dataset, with the published rows.
+        subjects: the columns before the mean.
+        found: subject -> what was measured, or None.
+        remarks: sentences below.
+    """
+    published = {column for row in about.rows for column in row.values}
+    columns = [subject for subject in subjects if subject in published or found.get(subject)]
+    lines = [
+        f"# {about.title}",
+        "",
+        f"PSNR (dB) / SSIM / LPIPS x 100{f', {about.table}' if about.table else ''}",
+        "",
+        f"| method | {' | '.join([*columns, MEAN])} |",
+        f"|---|{'---|' * (len(columns) + 1)}",
+    ]
+    for row in about.rows:
+        lines.append(line(f"{row.method} (published)", with_mean(row.values, subjects), columns))
+    for method, name in OURS.items():
+        values = {subject: measured(found.get(subject), method) for subject in columns}
+        known = {subject: value for subject, value in values.items() if value}
+        if known:
+            part = "" if len(known) == len(subjects) else f" ({len(known)} of {len(subjects)} subjects)"
+            lines.append(line(f"**{name}**{part}", with_mean(known, list(known)), columns))
+    return "\n".join([*lines, "", *(f"- {remark}" for remark in remarks), ""])
+
+
+def with_mean(values: Mapping[str, Values], subjects: Sequence[str]) -> dict[str, Values]:
+    """The values with the mean over the subjects, where it is not given and all are known."""
+    known = [values[subject] for subject in subjects if subject in values]
+    if MEAN in values or len(known) < len(subjects):
+        return dict(values)
+    return {
+        **values,
+        MEAN: tuple(average([value[place] for value in known]) for place in range(len(METRICS))),
+    }
+
+
+def line(name: str, values: Mapping[str, Values], columns: Sequence[str]) -> str:
+    """One row of the table."""
+    cells = [cell(values.get(column)) for column in (*columns, MEAN)]
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def cell(values: Values | None) -> str:
+    """``34.80 / 0.984 / 0.90``, or a dash."""
+    if not values:
+        return "-"
+    digits = (2, 3, 2)
+    return " / ".join("-" if v is None else f"{v:.{d}f}" for v, d in zip(values, digits, strict=True))
+
+
+def measured(summary: Mapping[str, Any] | None, method: str) -> Values | None:
+    """PSNR, SSIM and LPIPS times 100 of a method on the held-out frames."""
+    means = (summary or {}).get("means", {}).get(method)
+    if not means:
+        return None
+    psnr, ssim, lpips = (means.get(metric) for metric in METRICS)
+    return psnr, ssim, None if lpips is None else 100 * lpips
+
+
+def average(values: Sequence[float | None]) -> float | None:
+    """The mean of what is known."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
+
+
+def notes(about: Dataset, found: Mapping[str, tuple[dict[str, Any] | None, bool]]) -> list[str]:
+    """What must be said beside the numbers."""
+    remarks = [f"Published numbers: {about.protocol}"] if about.protocol else []
+    protocols = {one["protocol"] for one, _ in found.values() if one and one["protocol"]}
+    remarks += [f"Measured here: {protocol}" for protocol in sorted(protocols)]
+    missing = [subject for subject, (one, _) in found.items() if one is None]
+    if missing:
+        remarks.append(f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}")
+    other = [subject for subject, (one, current) in found.items() if one is not None and not current]
+    if other:
+        remarks.append(f"Under other settings than these words would give: {', '.join(other)}")
+    return remarks

@@ -1,0 +1,48 @@
+"""A stage in a process of its own, and why it failed."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.stage import REASON, process_environment
+
+_PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
+
+
+def stage_command(stage: str, subject: str, words: Mapping[str, str]) -> list[str]:
+    """The command line of one stage."""
+    pairs = [f"{name}={value}" for name, value in words.items() if name != "subject"]
+    return [sys.executable, "-m", "pipeline.stage", stage, "--subject", subject, *pairs]
+
+
+def run_stage_process(stage: str, subject: str, words: Mapping[str, str]) -> str | None:
+    """Runs a stage in a process that writes to this terminal and ends with this one.
+
+    Returns:
+        Why it failed, in a line; None where it did not.
+    """
+    with tempfile.TemporaryDirectory(prefix="flexiavatar-") as folder:
+        reason = Path(folder) / "reason"
+        environment = {**process_environment(), REASON: str(reason)}
+        command = stage_command(stage, subject, words)
+        prepare = _end_with_parent if sys.platform == "linux" else None
+        status = subprocess.run(command, env=environment, check=False, preexec_fn=prepare).returncode
+        said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
+    if status < 0:
+        return f"killed by signal {-status}; the same command goes on from here"
+    if status:
+        return said or f"stopped with status {status}; its own lines above say why"
+    return None
+
+
+def _end_with_parent() -> None:
+    """Lets the kernel end this process if the one that started it is killed."""
+    with contextlib.suppress(OSError, AttributeError):  # a C library without it
+        ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGTERM)

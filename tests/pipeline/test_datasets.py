@@ -1,0 +1,123 @@
+"""Datasets on the command line: their subjects, their settings, the end of a run, and the paper's table."""
+
+import json
+
+import pytest
+
+from pipeline.compare import table
+from pipeline.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
+from pipeline.errors import UserError
+from pipeline.settings import Layer
+from pipeline.subjects import load_subject
+from pipeline.workspace import open_workspace
+
+
+@pytest.fixture
+def many(toy):
+    for name in ("one", "two"):
+        (toy.data / "datasets" / f"{name}.toml").write_text(f'title = "{name}"\n[bend]\nangle = 3.0\n')
+    for name, dataset in (("cat", "one"), ("dog", "one"), ("eel", "two")):
+        toy.subject(name, f'dataset = "{dataset}"\n[source]\npath = "sources/ann.txt"\n')
+    return toy
+
+
+def test_a_dataset_runs_all_its_subjects_with_its_settings(many):
+    run = many.doit("dataset=one,two", options=("-n", "2", "-P", "thread"))
+    assert run.returncode == 0, run.stderr
+    assert sorted(line for line in many.ran() if "paint" in line) == ["paint:cat", "paint:dog", "paint:eel"]
+    painted = many.store / "eel" / "paint" / "latest" / "painted.txt"
+    assert painted.read_text() == "ann 3.0" * 3
+    assert "3 of 3 subjects done, 0 failed" in run.stdout
+    again = many.doit("dataset=one", "bend.angle=4")
+    assert again.returncode == 0 and "paint:eel" not in many.ran()
+    assert "ann 4.0" in (many.store / "cat" / "paint" / "latest" / "painted.txt").read_text()
+
+
+def test_the_end_of_a_run_says_who_failed_where_and_why(many):
+    many.subject("dog", 'dataset = "one"\n[source]\npath = "sources/ann.txt"\n[bend]\nfail = "user"\n')
+    many.subject("eel", 'dataset = "two"\n[source]\npath = "sources/gone.txt"\n')
+    for options in ((), ("-n", "2", "-P", "thread"), ("-n", "2")):
+        run = many.doit("dataset=one,two", options=options)
+        assert run.returncode != 0
+        last = run.stdout.strip().splitlines()[-4:]
+        assert last[0] == "1 of 3 subjects done, 2 failed"
+        assert last[1] == "  cat  done"
+        assert last[2] == "  dog  failed at bend: clip.mp4: is not a clip; name another"
+        assert last[3].startswith("  eel  failed at gather:") and "gone.txt" in last[3]
+    many.subject("dog", 'dataset = "one"\n[source]\npath = "sources/ann.txt"\n[bend]\nfail = "bug"\n')
+    run = many.doit("dataset=one")
+    assert "dog  failed at bend: ZeroDivisionError: ours" in run.stdout and "Traceback" in run.stderr
+
+
+def test_one_subject_needs_no_summary(many):
+    assert "subjects done" not in many.doit("subject=cat").stdout
+
+
+def test_a_dataset_with_a_subject_of_ones_own(many):
+    clip = many.root / "clip.txt"
+    clip.write_text("me ")
+    assert many.doit("subject=me", f"source={clip}", "dataset=one").returncode == 0
+    assert "me 3.0" in (many.store / "me" / "paint" / "latest" / "painted.txt").read_text()
+    assert many.ran() == ["gather:me", "bend:me", "paint:me"]
+
+
+def test_an_unknown_dataset_is_one_line(many):
+    for words in (("dataset=onee",), ("subject=cat", "dataset=onee")):
+        run = many.doit(*words)
+        assert run.returncode != 0 and "one" in run.stderr.split("did you mean")[1]
+        assert "Traceback" not in run.stderr
+    run = many.doit("dataset=pair")
+    assert run.returncode != 0 and 'says dataset = "pair"' in run.stderr and "Traceback" not in run.stderr
+
+
+def test_compare_puts_published_rows_beside_ours(many):
+    (many.data / "datasets" / "one.toml").write_text(
+        'title = "One"\nprotocol = "on white"\n[paper]\ntable = "Table 9"\n'
+        '[[paper.rows]]\nmethod = "Theirs"\ncat = [30.0, 0.9, 2.0]\ndog = [20.0, 0.8, 4.0]\n'
+        '[[paper.rows]]\nmethod = "Others"\nmean = [31.0, 0.95, 1.5]\n'
+    )
+    many.doit("subject=cat")
+    latest = (many.store / "cat" / "paint" / "latest").resolve()
+    means = {"avatar": {"psnr": 28.125, "ssim": 0.9, "lpips_alex": 0.0123}}
+    text = json.dumps({"means": {"test": means}, "protocol": "on black"})
+    (latest / "summary.json").write_text(text)
+    run = many.doit("compare", "dataset=one")
+    assert run.returncode == 0, run.stderr
+    assert (
+        "| Theirs (published) | 30.00 / 0.900 / 2.00 | 20.00 / 0.800 / 4.00 | 25.00 / 0.850 / 3.00 |"
+        in run.stdout
+    )
+    assert "| Others (published) | - | - | 31.00 / 0.950 / 1.50 |" in run.stdout
+    assert "| **here** (1 of 2 subjects) | 28.12 / 0.900 / 1.23 | - | 28.12 / 0.900 / 1.23 |" in run.stdout
+    assert "on white" in run.stdout and "on black" in run.stdout and "Not run: dog" in run.stdout
+    written = (many.store / "compare" / "one.md").read_text()
+    assert written.strip() in run.stdout
+    assert "compare needs a dataset" in many.doit("compare").stdout
+
+
+def test_a_dataset_without_published_numbers_has_a_table_too():
+    about = Dataset("x", "X", "", "", Layer("x", {}), "", ())
+    summary = {"means": {"avatar": {"psnr": 20.0, "ssim": None, "lpips_alex": None}}}
+    text = table(about, ["a", "b"], {"a": summary, "b": None}, [])
+    assert "| method | a | mean |" in text and "| 20.00 / - / - |" in text
+    with_rows = Dataset("x", "X", "", "", Layer("x", {}), "", (Row("T", {"b": (1.0, 2.0, 3.0)}),))
+    assert "| method | a | b | mean |" in table(with_rows, ["a", "b"], {"a": summary}, [])
+
+
+def test_the_papers_datasets_are_complete():
+    workspace = open_workspace()
+    counts = {"insta": 7, "neuman": 4, "samples": 3, "talkshow": 3, "wildavatar": 7, "zju": 6}
+    assert {name: len(subjects_of(workspace, name)) for name in known_datasets(workspace)} == counts
+    for name in counts:
+        about = load_dataset(workspace, name)
+        subjects = {*subjects_of(workspace, name), "mean"}
+        assert all(set(row.values) <= subjects for row in about.rows)
+        assert name == "samples" or (about.protocol and about.rows and about.obtain)
+    assert load_subject(workspace, "bala").obtain.startswith("take the actors")
+
+
+def test_a_row_that_is_no_row_names_its_file(tmp_path):
+    (tmp_path / "datasets").mkdir()
+    (tmp_path / "datasets" / "bad.toml").write_text('[[paper.rows]]\nmethod = "x"\nmean = [1.0]\n')
+    with pytest.raises(UserError, match=r"bad\.toml"):
+        load_dataset(open_workspace(data=tmp_path), "bad")

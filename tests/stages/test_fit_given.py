@@ -1,0 +1,158 @@
+"""Poses that a dataset came with, through the fit stage: kept as they are, started from, or ignored."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body import mean_identity, pose_body, read_identity, read_poses
+from pipeline.errors import UserError
+from pipeline.pose_files import RECORD, InitialPoses, read_record, with_flat_hands, write_record
+from pipeline.stage import Context
+from stages.fit.run import run
+from stages.fit.settings import FitSettings
+from stages.ingest.run import run as run_ingest
+from tests.stages import layout_writers as writers
+from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER
+from tests.stages.ingest_clips import make_context
+from tests.stages.layout_footage import COUNT, footage
+from tests.unit.fake_body import write_official
+
+
+@pytest.fixture(scope="module")
+def shown():
+    return footage()
+
+
+@pytest.fixture(scope="module")
+def ingested(shown, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prepared")
+    every = list(range(COUNT))
+    source = writers.prepared(folder / "me", shown, {"all": every, "train": every[:4], "test": every[4:]})
+    context = make_context(folder / "run", source)
+    run_ingest(context)
+    return context.output
+
+
+def fit(folder, ingested, **settings):
+    output, work = folder / "output", folder / "work"
+    output.mkdir(parents=True)
+    work.mkdir()
+    context = Context(
+        subject="me", settings=FitSettings(**settings), inputs={"ingest": ingested}, assets={}, source=None,
+        body=BODY_FOLDER, body_file=BODY_FILE, output=output, work=work, stage="fit",
+    )  # fmt: skip
+    run(context)
+    return output
+
+
+def surface_error(shown, output):
+    """How far vertices are from the truth, mean over frames and vertices, metres."""
+    poses, identity = (
+        read_poses(output / "poses.parquet"),
+        read_identity(output / "identity.safetensors", shown.body),
+    )
+    found, _ = pose_body(shown.body, identity, poses.rotation, poses.expression, poses.transl)
+    truth = shown.poses
+    true, _ = pose_body(shown.body, shown.identity, truth.rotation, truth.expression, truth.transl)
+    return float((found - true).norm(dim=-1).mean())
+
+
+def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, shown, ingested):
+    output = fit(tmp_path, ingested, given="keep")
+    # What is left are the float32 of poses and cameras.
+    assert surface_error(shown, output) < 1e-4
+    names = {path.name for path in output.iterdir()}
+    assert {
+        "identity.safetensors",
+        "poses.parquet",
+        "template.ply",
+        "overlay.mp4",
+        "residuals.parquet",
+    } <= names
+    raw = read_poses(output / "poses_raw.parquet")
+    assert torch.equal(raw.rotation, read_poses(output / "poses.parquet").rotation)  # not smoothed again
+
+
+def test_the_fit_starts_from_them(tmp_path, shown, ingested):
+    """Without steps the start is published: it is the files', and not the estimator's."""
+    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_window=0)
+    ignored = fit(tmp_path / "ignore", ingested, given="ignore", iterations=0, smoothing_window=0)
+    wanted = shown.poses.rotation
+    for output, near in ((started, True), (ignored, False)):
+        found = read_poses(output / "poses.parquet").rotation
+        difference = (found - wanted)[:, 1:22].norm(dim=-1).mean()
+        assert bool(difference < 0.02) == near
+
+
+def test_what_is_not_there_or_anothers_cannot_be_kept(tmp_path, ingested):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in ingested.iterdir():
+        if path.name != RECORD:
+            (bare / path.name).symlink_to(path)
+    with pytest.raises(UserError, match="no poses to keep"):
+        fit(tmp_path / "none", bare, given="keep")
+    record = read_record(ingested / RECORD)
+    write_record(bare / RECORD, dataclasses.replace(record, model="smplx"))
+    with pytest.raises(UserError, match="SMPLX_NEUTRAL"):
+        fit(tmp_path / "other", bare, given="keep")
+    write_record(bare / RECORD, dataclasses.replace(record, transl=None))
+    with pytest.raises(UserError, match="no place"):
+        fit(tmp_path / "placeless", bare, given="keep")
+
+
+def pca_poses(coefficients):
+    return InitialPoses(
+        frames=(0, 1), rotation=torch.zeros(2, 55, 3), expression=None, betas=None, transl=None,
+        valid=torch.ones(2, dtype=torch.bool), hands="mean", hand_pca=coefficients,
+    )  # fmt: skip
+
+
+def test_hand_coefficients_need_the_users_smplx_file(tmp_path):
+    rng = np.random.default_rng(0)
+    path = write_official(tmp_path / "SMPLX_NEUTRAL.npz")
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    components = rng.normal(size=(2, 45, 45))
+    means = rng.normal(size=(2, 45)) * 0.1
+    arrays |= {"hands_componentsl": components[0], "hands_componentsr": components[1]}
+    arrays |= {"hands_meanl": means[0], "hands_meanr": means[1]}
+    np.savez(path, **arrays)
+    coefficients = torch.from_numpy(rng.normal(size=(2, 2, 12)))
+    notes = []
+    found = with_flat_hands(pca_poses(coefficients), path, True, notes.append)
+    expected = means[None] + np.einsum("tsp,spk->tsk", coefficients.numpy(), components[:, :12])
+    np.testing.assert_allclose(found.rotation[:, 25:].numpy(), expected.reshape(2, 30, 3), atol=1e-5)
+    assert not notes and not found.rotation[:, :25].any()
+    relaxed = with_flat_hands(pca_poses(coefficients), path, False, notes.append)
+    np.testing.assert_allclose(relaxed.rotation[0, 25:].numpy(), means.reshape(30, 3), atol=1e-5)
+    assert "12 coefficients" in notes[0] and "body=SMPLX_NEUTRAL.npz" in notes[0]
+
+
+def test_records_come_back_and_damaged_ones_are_named(tmp_path, ingested):
+    record = read_record(ingested / RECORD)
+    write_record(tmp_path / RECORD, record)
+    again = read_record(tmp_path / RECORD)
+    for field in dataclasses.fields(record):
+        one, other = getattr(record, field.name), getattr(again, field.name)
+        assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+    (tmp_path / RECORD).write_bytes((tmp_path / RECORD).read_bytes()[:500])
+    with pytest.raises(UserError, match=RECORD):
+        read_record(tmp_path / RECORD)
+    with pytest.raises(ValueError, match="not finite"):
+        write_record(tmp_path / RECORD, dataclasses.replace(record, transl=record.transl * float("nan")))
+
+
+def test_mean_identity_stands_for_a_missing_shape(shown, ingested):
+    record = with_flat_hands(read_record(ingested / RECORD), BODY_FILE, False)
+    from stages.fit.pose_files.given import _identity
+
+    bare = dataclasses.replace(record, betas=None, joint_offset=None, face_offset=None)
+    found, mean = _identity(bare, shown.body, "nothing"), mean_identity(shown.body)
+    assert torch.equal(found.betas, mean.betas) and torch.equal(found.face_offset, mean.face_offset)
+    with pytest.raises(UserError, match="vertices"):
+        _identity(dataclasses.replace(record, face_offset=torch.zeros(10_475, 3)), shown.body, "nothing")
