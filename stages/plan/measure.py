@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
-from pipeline.body import JOINT_NAMES, PARTS, BodyModel, Identity, Poses, read_identity, read_poses
+from pipeline.body import PARTS, BodyModel, Identity, Poses, read_identity, read_poses
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
@@ -28,7 +28,7 @@ TRUSTED = 0.4  # score from which a keypoint is believed, as in Eq. 2
 SHOWN = 0.5  # share of a part's points that a frame must show
 LEAST_FRAMES = 0.05  # share of the training frames that must show a part for its size to count
 POINTS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
-MOVING_JOINTS = tuple(range(1, 22)) + (JOINT_NAMES.index("jaw"),)
+LEAST_POINTS, ALIGNMENTS, LAG = 4, 3, 2  # of keypoints that are laid over each other; LAG in frames
 
 RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
 """The columns of fit's residuals.parquet that are read."""
@@ -133,15 +133,43 @@ def part_pixels(clip: Clip, part: str) -> float:
     return float(np.median(sizes))
 
 
-def pose_change(clip: Clip) -> tuple[float, str]:
-    """How far the most moving joint of body and jaw turns about its mean, degrees RMS, and its name."""
-    rows = [clip.poses.index(frame) for frame in clip.split.train]
-    matrices = roma.rotvec_to_rotmat(clip.poses.rotation[rows][:, MOVING_JOINTS].double())
-    mean = roma.special_procrustes(matrices.mean(0))
-    angle = roma.rotmat_geodesic_distance(matrices, mean.expand_as(matrices))
-    spread = torch.rad2deg(angle.square().mean(0).sqrt())
-    most = int(spread.argmax())
-    return float(spread[most]), JOINT_NAMES[MOVING_JOINTS[most]]
+def pose_change(clip: Clip) -> float:
+    """How far the person changes shape in the picture, in parts of the person's size.
+
+    Joints that are not seen are fitted to anything, so the fit's own angles say little here; the trusted
+    keypoints of each frame are laid over their mean shape instead (moved, turned, scaled), and what is
+    left is looked at. A detector's errors do not last, and movements do: so it is not the variance that is
+    taken but the covariance with what is left ``LAG`` frames later. The number is that of the point at
+    the 90th percentile, as a length.
+    """
+    points = clip.keypoints.whole_body[np.isin(clip.keypoints.frames, clip.split.train)]
+    trusted = points[..., 2] >= TRUSTED
+    often = trusted.mean(0) >= SHOWN
+    trusted = trusted[:, often]
+    places = np.where(trusted, points[:, often, 0] + 1j * points[:, often, 1], np.nan)
+    usable = trusted.sum(1) >= LEAST_POINTS
+    if usable.sum() <= LAG:
+        return 0.0
+    laid = places = places[usable]
+    for _ in range(ALIGNMENTS):
+        mean = np.nanmean(laid, 0)
+        laid = np.stack([_laid_over(one, mean) for one in places])
+    mean = np.nanmean(laid, 0)
+    size = float(np.sqrt(np.mean(np.abs(mean - mean.mean()) ** 2)))
+    left = laid - mean
+    lasting = np.real(left[LAG:] * np.conj(left[:-LAG]))
+    known = ~np.isnan(lasting).all(0)
+    covariance = np.nanmean(lasting[:, known], 0).clip(min=0)
+    return float(np.percentile(np.sqrt(covariance), 90)) / size if size and known.any() else 0.0
+
+
+def _laid_over(points: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Points of a plane, [N] complex, moved, turned and scaled onto a mean shape; NaN is left out."""
+    both = ~np.isnan(points) & ~np.isnan(mean)
+    mine, theirs = points[both].mean(), mean[both].mean()
+    apart = points[both] - mine
+    factor = (np.conj(apart) * (mean[both] - theirs)).sum() / max(float((np.abs(apart) ** 2).sum()), 1e-12)
+    return (points - mine) * factor + theirs
 
 
 def unseen_azimuths(clip: Clip, joints: Tensor) -> tuple[float, tuple[float, ...]]:
