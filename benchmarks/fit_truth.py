@@ -35,7 +35,7 @@ from pipeline.body import (
 )
 from pipeline.camera import Camera, project
 from pipeline.keypoints import Keypoints
-from stages.fit.pose_files import InitialPoses
+from pipeline.pose_files import InitialPoses
 from stages.ingest.mannequin import DETECTORS, MannequinSpec
 from stages.ingest.mannequin.detector import detect
 from stages.ingest.mannequin.footage import Filming

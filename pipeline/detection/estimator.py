@@ -48,19 +48,21 @@ class Estimate:
 
 
 class Estimator:
-    """Follows one person through a clip; pictures must come in order."""
+    """Follows one person through a clip; pictures must come in order, unless each stands for itself."""
 
-    def __init__(self, asset: Path, native_log: Path) -> None:
+    def __init__(self, asset: Path, native_log: Path, still: bool = False) -> None:
         """Load the models from the asset's folder; UserError if they cannot be loaded.
 
         Args:
             asset: the folder that holds ``mediapipe/``.
             native_log: where the models' native code may write its remarks.
+            still: look at every picture as if it were the first.
         """
         solutions = load(asset)
         self._native_log = native_log
         with aside(native_log):
             self._holistic = solutions.holistic.Holistic(
+                static_image_mode=still,
                 model_complexity=1,
                 enable_segmentation=True,
                 smooth_segmentation=False,  # masks are made steady later, along the motion

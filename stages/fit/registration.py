@@ -15,6 +15,7 @@ from pipeline.camera import Camera
 from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
+from pipeline.pose_files import InitialPoses
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
@@ -22,7 +23,7 @@ from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
 from stages.fit.optimise import Watch, optimise
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
-from stages.fit.pose_files import InitialPoses, initial_facing, initial_from_files
+from stages.fit.pose_start import initial_facing, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.solver import STEPS, solve

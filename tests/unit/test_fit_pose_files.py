@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from pipeline.body import joint_index, posed_joints
 from pipeline.camera import facing_camera
 from pipeline.errors import UserError
-from stages.fit.pose_files import read_hand_mean, read_initial_poses
-from stages.fit.pose_files.axes import into_camera, into_world, moved_pivot
+from pipeline.pose_files import read_hand_mean, read_initial_poses
+from pipeline.pose_files.axes import into_camera, into_world, moved_pivot
 from tests.unit.fake_body import PARENTS, write_official
 
 FLAT = torch.zeros(30, 3)

@@ -6,11 +6,11 @@ SMPLest-X, Hand4Whole, ExAvatar and FlexiAvatar's own release write the same nam
 these are relative to.
 """
 
-from stages.fit.pose_files.export import write_peer_files
-from stages.fit.pose_files.read import InitialPoses, read_hand_mean, read_initial_poses
-from stages.fit.pose_files.start import initial_facing, initial_from_files, is_official_smplx
+from pipeline.pose_files.axes import into_camera, into_world, moved_pivot
+from pipeline.pose_files.export import tool_joints, write_peer_files
+from pipeline.pose_files.read import InitialPoses, read_hand_mean, read_initial_poses
 
 __all__ = [
-    "InitialPoses", "initial_facing", "initial_from_files", "is_official_smplx", "read_hand_mean",
-    "read_initial_poses", "write_peer_files",
+    "InitialPoses", "into_camera", "into_world", "moved_pivot", "read_hand_mean", "read_initial_poses",
+    "tool_joints", "write_peer_files",
 ]  # fmt: skip

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel
+from pipeline.pose_files.axes import into_world
+from pipeline.pose_files.read import InitialPoses
 from stages.fit.facing import pose_facing
 from stages.fit.initialise import weak_perspective
 from stages.fit.observations import Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
-from stages.fit.pose_files.axes import into_world
-from stages.fit.pose_files.read import InitialPoses
 from stages.fit.views import Views
 
 _VERTICES, _TRIANGLES = 10_475, 20_908  # of every release of SMPL-X

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
-from stages.fit.pose_files.axes import HAND_JOINTS
+from pipeline.pose_files.axes import HAND_JOINTS
 
 _ROTATIONS = {  # name -> numbers, in the order of the schema's joints
     "root_pose": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3,
