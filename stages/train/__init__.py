@@ -5,12 +5,20 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=2,
+    version=3,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={
         "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json", "footage.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
+        "auxiliary": (
+            "frames/*",
+            "masks/*",
+            "trust/*",
+            "cameras.parquet",
+            "poses.parquet",
+            "auxiliary.json",
+        ),
     },
     assets=lambda settings: ("lpips",) if settings.lpips else (),
     reads_body=True,

@@ -21,6 +21,7 @@ from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.data import Frames, person_box, spread
+from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
 from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
@@ -38,6 +39,7 @@ class Inputs:
         crops: training frames around the person.
         whole: uncropped frames.
         times: seconds of frames from the clip's start, of all that have a time.
+        generated: frames that a model made of sides the camera never saw, if there are any.
     """
 
     body: BodyModel
@@ -47,10 +49,22 @@ class Inputs:
     crops: Frames
     whole: Frames
     times: Mapping[int, float]
+    generated: Generated | None = None
+
+    @property
+    def views(self) -> Frames:
+        """Every frame that is learnt from, captured and generated."""
+        return BothFrames(self.crops, self.generated.views) if self.generated else self.crops  # type: ignore[return-value]
+
+    @property
+    def all_poses(self) -> Poses:
+        """The poses of captured and generated frames."""
+        return joined(self.poses, self.generated.poses) if self.generated else self.poses
 
     def evidence(self, texture: Tensor | None) -> Evidence:
         """The training frames, and the mean colours that they show, [N, 3]."""
-        return Evidence(self.crops, self.split.train, self.times, texture)
+        made = self.generated.frames if self.generated else ()
+        return Evidence(self.views, (*self.split.train, *made), self.times, texture)
 
 
 def run(context: Context) -> None:
@@ -70,7 +84,7 @@ def run(context: Context) -> None:
 def train_subject(context: Context) -> None:
     """Reads the inputs, trains, and writes what is published."""
     inputs, settings = read_inputs(context), context.settings
-    refinement = PoseRefinement(inputs.poses, inputs.split.train)
+    refinement = PoseRefinement(inputs.all_poses, inputs.split.train)
     started = time.monotonic()
     avatar, visibility, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
@@ -79,7 +93,7 @@ def train_subject(context: Context) -> None:
     train(trainer, inputs, context)
     trainer.require_finite()
     save_avatar(context.output / "avatar.safetensors", trainer.avatar)
-    write_poses(context.output / "poses.parquet", refinement.refined())
+    write_poses(context.output / "poses.parquet", refinement.refined(inputs.poses.frames))
     write_visibility(context.output / "visibility.parquet", visibility)
     trainer.curve.write(context.output / "curve.parquet")
 
@@ -103,6 +117,7 @@ def read_inputs(context: Context) -> Inputs:
         crops=Frames(ingest, cameras, box),
         whole=Frames(ingest, cameras),
         times=dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False)),
+        generated=read_generated(context.inputs.get("auxiliary"), poses),
     )
 
 
@@ -120,7 +135,8 @@ def prepare(
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0, scale=settings.scale)
     body = Avatar(inputs.body, inputs.identity, everything, bare).eval()
     body.pose_heads_active = False
-    visibility = measure(body, refinement, inputs.crops, chosen, settings.gate_rings)
+    made = spread(inputs.generated.frames, settings.gate_frames) if inputs.generated else ()
+    visibility = measure(body, refinement, inputs.views, chosen, settings.gate_rings, made)
     if not bool((visibility.frames > 0).any()):
         raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
     if not settings.gate:
@@ -137,7 +153,7 @@ def prepare(
     )
     texture = None
     if settings.initial_color or settings.face:
-        logits = first_colors(avatar.eval(), refinement, inputs.crops, chosen, settings.mask_band)
+        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)
@@ -173,7 +189,8 @@ def architecture(settings: TrainSettings, residual_parts: tuple[str, ...]) -> Ar
 def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     """Runs the iterations that are left, with checkpoints and points of the curve."""
     settings = context.settings
-    key = run_key(as_dict(settings), [inputs.poses.rotation, inputs.poses.transl, trainer.avatar.kept])
+    poses = inputs.all_poses
+    key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
     started, first = time.monotonic(), trainer.iteration

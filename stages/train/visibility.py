@@ -17,14 +17,21 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.camera import project
 from pipeline.splat import Gaussians, render
 from pipeline.tables import write_table
-from stages.train.data import Frames
+from stages.train.data import Frames, View
 from stages.train.losses import trust
 from stages.train.poses import PoseRefinement
 
 SCHEMA = pa.schema(
-    [("vertex", pa.int32()), ("frames", pa.int32()), ("weight", pa.float32()), ("kept", pa.bool_())]
+    [
+        ("vertex", pa.int32()),
+        ("frames", pa.int32()),
+        ("weight", pa.float32()),
+        ("kept", pa.bool_()),
+        ("generated", pa.int32()),
+    ]
 )
 DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
 BELIEVED = 0.5  # trust from which a pixel has a say in first colours
@@ -40,16 +47,29 @@ class Visibility:
         frames: [V] int64, in how many of them the vertex contributed to the image.
         weight: [V], its blending weight summed over pixels and frames.
         kept: [V] bool, whether it carries a Gaussian.
+        generated: [V] int64, in how many generated frames it contributed; counted apart, so that what a
+            model made up never passes for something that was seen. All zero if not given.
     """
 
     looked_at: int
     frames: Tensor  # [V]
     weight: Tensor  # [V]
     kept: Tensor  # [V]
+    generated: Tensor = None  # type: ignore[assignment]  # [V]; never None once it is made
+
+    def __post_init__(self) -> None:
+        """Without generated frames nothing is seen in them."""
+        if self.generated is None:
+            object.__setattr__(self, "generated", torch.zeros_like(self.frames))
 
 
 def measure(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], rings: int
+    avatar: Avatar,
+    poses: PoseRefinement,
+    views: Frames,
+    chosen: tuple[int, ...],
+    rings: int,
+    made: tuple[int, ...] = (),
 ) -> Visibility:
     """Renders the fitted body in the chosen frames.
 
@@ -59,15 +79,40 @@ def measure(
         views: the cameras.
         chosen: frame numbers.
         rings: of neighbours that are kept with what was seen.
+        made: numbers of generated frames, in which a vertex may be seen as well.
+    """
+    frames, weight = _counted(avatar, poses, views, chosen)
+    generated = _counted(avatar, poses, views, made)[0]
+    kept = dilate((frames > 0) | (generated > 0), avatar.surfaces[0].canonical.faces, rings)
+    return Visibility(len(chosen), frames, weight, kept, generated)
+
+
+@torch.no_grad()
+def _counted(
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """In how many frames each vertex contributed, and its blending weight over all of them, [V] each.
+
+    In a generated frame only what lies within its mask counts: it is cropped to what the clip frames.
     """
     frames, weight = torch.zeros(len(avatar), dtype=torch.long), torch.zeros(len(avatar))
-    with torch.no_grad():
-        for frame in chosen:
-            rendering = render(_gaussians(avatar, poses, frame), views[frame].camera)
-            frames += rendering.weights > 0
-            weight += rendering.weights
-    kept = dilate(frames > 0, avatar.surfaces[0].canonical.faces, rings)
-    return Visibility(len(chosen), frames, weight, kept)
+    for frame in chosen:
+        view, gaussians = views[frame], _gaussians(avatar, poses, frame)
+        rendering = render(gaussians, view.camera)
+        seen = rendering.weights > 0
+        if view.generated:
+            seen &= _within(view, gaussians.means)
+        frames += seen
+        weight += rendering.weights
+    return frames, weight
+
+
+def _within(view: View, points: Tensor) -> Tensor:
+    """Whether points fall on the person in a frame, [N, 3] -> [N] bool."""
+    columns, rows = project(view.camera, points).floor().long().unbind(1)
+    inside = (columns >= 0) & (rows >= 0) & (columns < view.camera.width) & (rows < view.camera.height)
+    place = rows.clamp(0, view.camera.height - 1), columns.clamp(0, view.camera.width - 1)
+    return inside & (view.alpha[place] > 0.5)
 
 
 def write_visibility(path: Path, visibility: Visibility) -> None:
@@ -77,12 +122,18 @@ def write_visibility(path: Path, visibility: Visibility) -> None:
         "frames": visibility.frames.numpy(),
         "weight": visibility.weight.numpy(),
         "kept": visibility.kept.numpy(),
+        "generated": visibility.generated.numpy(),
     }
     write_table(path, SCHEMA, columns)
 
 
 def first_colors(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int = 0
+    avatar: Avatar,
+    poses: PoseRefinement,
+    views: Frames,
+    chosen: tuple[int, ...],
+    band: int = 0,
+    made: tuple[int, ...] = (),
 ) -> Tensor:
     """Logits of the mean colour that the chosen frames show at each Gaussian, [N, 3].
 
@@ -97,6 +148,24 @@ def first_colors(
         chosen: frame numbers.
         band: pixels on either side of the silhouette where the mask is in doubt. What is seen there
             alone takes its neighbours' colour, not that of the background which the mask may hold.
+        made: generated frames; they are asked for what no chosen frame shows.
+    """
+    total, weight = _shown(avatar, poses, views, chosen, band)
+    if made:
+        total_made, weight_made = _shown(avatar, poses, views, made, band)
+        unseen = weight == 0
+        total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
+    neighbours = avatar.surfaces[-1].neighbours
+    return torch.logit(_fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+
+
+def _shown(
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int
+) -> tuple[Tensor, Tensor]:
+    """Colours that some frames show at each Gaussian, summed by blending weight, and the weights.
+
+    Returns:
+        [N, 3] and [N, 1].
     """
     total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar), 1)
     for frame in chosen:
@@ -110,8 +179,7 @@ def first_colors(
         person = (believed & (view.alpha > 0.5)).float()[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
-    neighbours = avatar.surfaces[-1].neighbours
-    return torch.logit(_fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+    return total, weight
 
 
 def _fill(total: Tensor, weight: Tensor, neighbours) -> Tensor:
