@@ -65,8 +65,8 @@ class AuxiliarySettings:
             raise ValueError("auxiliary.generator=mimicmotion needs auxiliary.weights=FOLDER")
         if self.texture_levels not in (0, 1, 2):
             raise ValueError("auxiliary.texture_levels must be 0, 1 or 2")
-        if not 0 <= self.overlap < self.tile:
-            raise ValueError("auxiliary.overlap must be less than auxiliary.tile")
+        if not 1 <= self.overlap < self.tile - 1:
+            raise ValueError("auxiliary.overlap must be at least 1 and less than auxiliary.tile - 1")
         self._require(("frames",), 4)
         self._require(("width", "height"), 64)
         self._require(("texture_frames", "steps"), 1)
