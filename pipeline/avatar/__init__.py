@@ -1,6 +1,7 @@
 """The avatar: a canonical triplane that is decoded to Gaussians and posed with the body."""
 
-from pipeline.avatar.avatar import Architecture, Avatar, Decoded, Posed, Surface, pose_features
+from pipeline.avatar.architecture import Architecture
+from pipeline.avatar.avatar import Avatar, Decoded, Posed, Surface, pose_features
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.storage import load_avatar, save_avatar
 

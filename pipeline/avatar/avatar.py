@@ -14,10 +14,12 @@ import roma
 import torch
 from torch import Tensor, nn
 
+from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.canonical import HANDS, HEAD, Canonical, build_canonical
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region, Residuals, regions
+from pipeline.avatar.restrict import active_rows, restricted
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
 from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms
@@ -25,43 +27,6 @@ from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
 LARGEST_SCALE = 0.03  # metres
-
-
-@dataclasses.dataclass(frozen=True)
-class Architecture:
-    """Everything that must be known to rebuild an avatar's networks; stored in its file.
-
-    Attributes:
-        plane_resolution: texels along a side of each plane.
-        plane_channels: features a texel; three planes give ``f_i`` three times as many.
-        width: hidden channels of the heads.
-        groups: of GroupNorm in the heads.
-        subdivisions: levels of midpoint subdivision of the body mesh.
-        offset_unit, pose_offset_unit: metres that a head's output of 1 stands for.
-        scale: initial standard deviation along the surface, in distances to the neighbours.
-        thickness: initial standard deviation along the normal, in those along the surface.
-        opacity: of every Gaussian.
-        residual_parts: parts that have a residual colour head, if any of their vertices is kept.
-        residual_width: hidden channels of those heads.
-        residual_place: which place they are told, ``"canonical"`` or ``"posed"`` (see ``residual.py``).
-        place_frequencies, time_frequencies: of the encodings of that place and of the time.
-    """
-
-    plane_resolution: int = 128
-    plane_channels: int = 32
-    width: int = 128
-    groups: int = 8
-    subdivisions: int = 1
-    offset_unit: float = 0.02
-    pose_offset_unit: float = 0.01
-    scale: float = 0.55
-    thickness: float = 0.5
-    opacity: float = 0.999
-    residual_parts: tuple[str, ...] = ()
-    residual_width: int = 64
-    residual_place: str = "canonical"
-    place_frequencies: int = 6
-    time_frequencies: int = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +41,7 @@ class Surface:
             follow the body model alone.
         rig: the mesh as skinning without gradient needs it.
         residual: the parts that have a residual colour head.
+        rows: [N] int64, which of the level's vertices these are; None where they are all of them.
     """
 
     canonical: Canonical
@@ -84,6 +50,11 @@ class Surface:
     pliable: Tensor  # [N, 1]
     rig: Rig
     residual: tuple[Region, ...] = ()
+    rows: Tensor | None = None
+
+    def pick(self, values: Tensor) -> Tensor:
+        """The rows of this surface in what is known of every vertex of the finest level: [M, C] -> [N, C]."""
+        return values[: len(self.canonical)] if self.rows is None else values[self.rows]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,13 +103,16 @@ class Avatar(nn.Module):
         kept: [K] int64, the body vertices that carry Gaussians.
         identity: the fitted identity.
         body_digest: of the body model that it was built on.
-        surfaces: every level from the unsubdivided mesh to the finest.
+        surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
+        active: [K] bool, the kept vertices that the visibility gate leaves; see ``surface``.
+        unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
     """
 
     base_color: Tensor
+    active: Tensor
 
     def __init__(
         self,
@@ -162,7 +136,7 @@ class Avatar(nn.Module):
         super().__init__()
         self.architecture, self.kept, self.identity = architecture, kept, identity
         self.body_digest, self.half_precision = body.digest, half_precision
-        self.pose_heads_active = self.residuals_active = True
+        self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
         meshes = [
             build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
         ]
@@ -173,6 +147,9 @@ class Avatar(nn.Module):
             for mesh, parts in zip(meshes, residual, strict=True)
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
+        self.register_buffer("active", torch.ones(len(kept), dtype=torch.bool))
+        self.unseen = "nothing"
+        self._restricted: dict[int, tuple[Tensor, Surface]] = {}
         self._build_networks(seed)
         self._baked: Decoded | None = None
 
@@ -186,8 +163,9 @@ class Avatar(nn.Module):
             torch.manual_seed(seed)
             self.geometry = Head(features, 6, **hidden)
             self.color = Head(features, 3, **hidden)
-            self.pose_geometry = Head(features, 6, condition=pose, **hidden)
-            self.pose_color = Head(features + 3, 3, condition=pose, **hidden)
+            if sizes.pose_heads:
+                self.pose_geometry = Head(features, 6, condition=pose, **hidden)
+                self.pose_color = Head(features + 3, 3, condition=pose, **hidden)
             # Last, so that an avatar with them starts from the same weights as one without.
             self.residuals = Residuals(
                 tuple(region.part for region in self.surfaces[0].residual),
@@ -200,7 +178,27 @@ class Avatar(nn.Module):
 
     def __len__(self) -> int:
         """The number of Gaussians."""
-        return len(self.surfaces[-1].canonical)
+        return len(self.surface().canonical)
+
+    def gate(self, active: Tensor) -> None:
+        """Leaves only some of the kept vertices; others may come back with a later call.
+
+        Args:
+            active: [K] bool, with at least one.
+        """
+        self.active.copy_(active)
+        self._baked = None
+
+    def surface(self, level: int = -1) -> Surface:
+        """A level of subdivision without what is gated (the finest by default)."""
+        full, level = self.surfaces[level], level % len(self.surfaces)
+        if bool(self.active.all()):
+            return full
+        known = self._restricted.get(level)
+        if known is None or not torch.equal(known[0], self.active):
+            rows = active_rows(self.surfaces[0].canonical, self.active, level)
+            known = self._restricted[level] = self.active.clone(), restricted(full, rows)
+        return known[1]
 
     def train(self, mode: bool = True) -> Avatar:
         """As of ``nn.Module``; forgets what was decoded, since weights are about to change."""
@@ -212,7 +210,7 @@ class Avatar(nn.Module):
 
     def decode(self, level: int = -1) -> Decoded:
         """The pose-independent part, on one level of subdivision (the finest by default)."""
-        surface = self.surfaces[level]
+        surface = self.surface(level)
         features = self.triplane(surface.samples)
         with self._autocast():
             geometry, color = self.geometry(features), self.color(features)
@@ -222,7 +220,7 @@ class Avatar(nn.Module):
             features=features,
             offset=geometry[:, :3] * self.architecture.offset_unit,
             log_scale=geometry[:, 3:],
-            color_logit=self.base_color[: len(features)] + color.float(),
+            color_logit=surface.pick(self.base_color) + color.float(),
         )
 
     def pose(
@@ -305,7 +303,41 @@ class Avatar(nn.Module):
         if self._baked is None:
             with torch.no_grad():
                 self._baked = self.decode()
-        return self.pose(self._baked, rotation, expression, transl, time=time).gaussians
+        seen = self.pose(self._baked, rotation, expression, transl, time=time).gaussians
+        if self.unseen == "nothing" or bool(self.active.all()):
+            return seen
+        bare = self.bare(self._unseen_surface(), rotation, expression, transl)
+        fields = [field.name for field in dataclasses.fields(Gaussians)]
+        return Gaussians(**{name: torch.cat([getattr(seen, name), getattr(bare, name)]) for name in fields})
+
+    def bare(self, surface: Surface, rotation: Tensor, expression: Tensor, transl: Tensor) -> Gaussians:
+        """The fitted body in its base colours, in a pose: what no network has a say in.
+
+        Args:
+            surface: which of its vertices.
+            rotation, expression, transl: as for ``gaussians``.
+        """
+        canonical = surface.canonical
+        transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
+        shape = _rest_shape(canonical, rotation, expression)
+        return Gaussians(
+            means=_transform(blend_transforms(transforms, canonical.skinning_weights), shape) + transl,
+            quaternions=surface.rig.place(transforms, shape, transl)[1],
+            scales=self._scales(canonical, torch.zeros(len(canonical), 3)),
+            colors=torch.sigmoid(surface.pick(self.base_color)),
+            opacities=torch.full((len(canonical),), self.architecture.opacity),
+        )
+
+    def _unseen_surface(self) -> Surface:
+        """What the gate took from the finest level."""
+        known = self._restricted.get(-1)
+        if known is None or not torch.equal(known[0], self.active):
+            left = self.surface().rows
+            rest = torch.ones(len(self.surfaces[-1].canonical), dtype=torch.bool)
+            rest[left] = False
+            rows = torch.nonzero(rest)[:, 0]
+            known = self._restricted[-1] = self.active.clone(), restricted(self.surfaces[-1], rows)
+        return known[1]
 
 
 def pose_features(rotation: Tensor) -> Tensor:

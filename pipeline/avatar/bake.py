@@ -179,7 +179,10 @@ class BakedAvatar:
 
 @torch.no_grad()
 def bake(avatar: Avatar) -> BakedAvatar:
-    """Computes the pose-independent part of a finished avatar; the avatar is left as it is."""
+    """Computes the pose-independent part of a finished avatar; the avatar is left as it is.
+
+    What the visibility gate took is not in it, whatever ``Avatar.unseen`` says.
+    """
     decoded = avatar.decode()
     surface, features = decoded.surface, decoded.features
     kind = torch.bfloat16 if avatar.half_precision else torch.float32

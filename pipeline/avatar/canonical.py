@@ -120,7 +120,7 @@ def build_canonical(
     ]
     if body.pose_directions is not None:
         carried.append(body.pose_directions)
-    faces = _faces_of(faces, kept, len(vertices))
+    faces = faces_among(faces, kept, len(vertices))
     faces, attributes = subdivide(faces, *(attribute[kept] for attribute in carried), levels=levels)
     vertices, weights, directions, labels, normals, *correctives = attributes
     frames = tangent_frames(functional.normalize(normals, dim=-1))
@@ -165,7 +165,8 @@ def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
     return (2 * total / degree[:, None]).sqrt().clamp(SMALLEST_SPACING, LARGEST_SPACING)
 
 
-def _faces_of(faces: Tensor, kept: Tensor, count: int) -> Tensor:
+def faces_among(faces: Tensor, kept: Tensor, count: int) -> Tensor:
+    """The triangles whose three corners are kept, in the numbers that these then have: [F, 3] -> [G, 3]."""
     new_index = torch.full((count,), -1, dtype=torch.long)
     new_index[kept] = torch.arange(len(kept))
     inside = (new_index[faces] >= 0).all(1)

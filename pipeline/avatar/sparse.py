@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 
+import numpy as np
 import scipy.sparse
 import torch
 from torch import Tensor
@@ -40,9 +41,41 @@ class SparsePair:
         entries = scipy.sparse.coo_array((values.numpy(), (rows.int().numpy(), columns.int().numpy())), shape)
         return cls(_to_torch(entries.tocsr()), _to_torch(entries.T.tocsr()))
 
+    def of_rows(self, rows: Tensor) -> SparsePair:
+        """Some of the rows, [R] int64 -> a pair of shape [R, K]."""
+        return SparsePair._of(_to_scipy(self.matrix)[rows.numpy()])
+
+    def mean_among(self, members: Tensor) -> SparsePair:
+        """A square matrix of means over neighbours, among some of its members alone.
+
+        Each row is divided by what is left of its sum; a member that no neighbour is left of is its own.
+
+        Args:
+            members: [R] int64.
+
+        Returns:
+            A pair of shape [R, R].
+        """
+        chosen = members.numpy()
+        among = _to_scipy(self.matrix)[chosen][:, chosen]
+        left = np.asarray(among.sum(1), np.float64).ravel()
+        scaled = scipy.sparse.diags_array(1 / np.where(left > 0, left, 1)) @ among
+        alone = scipy.sparse.diags_array((left == 0).astype(np.float64))
+        return SparsePair._of((scaled + alone).astype(np.float32).tocsr())
+
+    @classmethod
+    def _of(cls, matrix: scipy.sparse.csr_array) -> SparsePair:
+        matrix.eliminate_zeros()
+        return cls(_to_torch(matrix), _to_torch(matrix.T.tocsr()))
+
     def __matmul__(self, dense: Tensor) -> Tensor:
         """``matrix @ dense``, [K, C] -> [M, C]; the backward pass is ``transpose @ gradient``."""
         return _Product.apply(dense, self)
+
+
+def _to_scipy(matrix: Tensor) -> scipy.sparse.csr_array:
+    parts = (matrix.values(), matrix.col_indices(), matrix.crow_indices())
+    return scipy.sparse.csr_array(tuple(part.numpy() for part in parts), shape=tuple(matrix.shape))
 
 
 def _to_torch(matrix: scipy.sparse.csr_array) -> Tensor:

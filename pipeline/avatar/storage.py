@@ -11,19 +11,20 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pipeline.avatar.avatar import Architecture, Avatar
+from pipeline.avatar.architecture import Architecture
+from pipeline.avatar.avatar import Avatar
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError
 
-FORMAT = "flexiavatar-avatar-2"
+FORMAT = "flexiavatar-avatar-3"
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
 def save_avatar(path: Path, avatar: Avatar) -> None:
     """Writes the avatar; equal avatars give equal bytes.
 
-    The file holds the weights, the identity and which body vertices are kept. The body model itself
-    is not in it: ``load_avatar`` needs the one that the avatar was built on.
+    The file holds the weights, the identity, and which body vertices are kept and not gated. The body model
+    itself is not in it: ``load_avatar`` needs the one that the avatar was built on.
 
     Raises:
         ValueError: if any number in it is not finite.
@@ -42,6 +43,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         "half_precision": avatar.half_precision,
         "pose_heads_active": avatar.pose_heads_active,
         "residuals_active": avatar.residuals_active,
+        "unseen": avatar.unseen,
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
@@ -78,6 +80,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
         raise UserError(f"{path} does not fit its own description; run the train stage again") from error
     avatar.pose_heads_active = header["pose_heads_active"]
     avatar.residuals_active = header["residuals_active"]
+    avatar.unseen = header["unseen"]
     return avatar.eval()
 
 

@@ -11,6 +11,7 @@ STAGE = Stage(
     needs={
         "ingest": ("frames/*", "masks/*", "cameras.parquet", "keypoints.parquet", "split.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
+        "plan": ("plan.json",),
     },
     assets=lambda settings: settings.assets,
     reads_body=True,

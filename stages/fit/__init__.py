@@ -5,7 +5,7 @@ from stages.fit.settings import FitSettings
 
 STAGE = Stage(
     name="fit",
-    version=4,
+    version=5,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={"ingest": ("keypoints.parquet", "cameras.parquet", "footage.json", "frames/*", "masks/*")},

@@ -41,6 +41,7 @@ class Registration:
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
         curve: loss and reprojection error over the steps.
         seconds: (step, seconds since the start) at the curve's points.
+        face_frames: in how many frames a face was fitted first; 0 where none was.
     """
 
     identity: Identity
@@ -49,6 +50,7 @@ class Registration:
     error: Tensor
     curve: Curve
     seconds: tuple[tuple[int, float], ...]
+    face_frames: int = 0
 
 
 def register(
@@ -102,7 +104,8 @@ def register(
     fitted = _minimised(objective, initial, frozen, settings, recorder)
     identity, poses = _outcome(objective, fitted, spread)
     error = objective.residuals(fitted)
-    return Registration(identity, poses, observations, error, recorder.curve, tuple(recorder.seconds))
+    seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
+    return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
 
 
 def _minimised(

@@ -24,7 +24,7 @@ from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import read_hand_mean, read_initial_poses, write_peer_files
-from pipeline.records import read_cameras, read_footage
+from pipeline.records import read_cameras, read_footage, write_json
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
@@ -56,6 +56,8 @@ def _run(context: Context) -> None:
     smoothed = smooth(fitted.poses, context.settings.smoothing_window)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
+    registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
+    write_json(context.output / "face.json", registered)  # what the plan says of face registration
     fitted.curve.write(context.output / "curve.parquet")
     write_template(context.output / "template.ply", body, fitted.identity)
     start = time.monotonic()

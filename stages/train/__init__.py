@@ -11,6 +11,7 @@ STAGE = Stage(
     needs={
         "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json", "footage.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
+        "plan": ("plan.json",),
         "auxiliary": (
             "frames/*",
             "masks/*",

@@ -14,9 +14,8 @@ from torch import Tensor
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
-from stages.train.losses import WINDOW
+from pipeline.person import Box
 
-FAINTEST = 8  # of 255: alpha under this is taken for noise when the person's box is sought
 CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are drawn
 
 
@@ -42,16 +41,6 @@ class View:
         """The person over a plain background, [3] -> [H, W, 3]."""
         alpha = self.alpha[..., None]
         return self.color * alpha + (1 - alpha) * background
-
-
-@dataclasses.dataclass(frozen=True)
-class Box:
-    """A rectangle of pixels: columns left to right - 1, rows top to bottom - 1."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 class Frames:
@@ -80,11 +69,15 @@ class Frames:
     def __getitem__(self, frame: int) -> View:
         """The crop of frame number ``frame``."""
         color, alpha = self._read(frame)
-        box, camera = self.box, self.cameras[frame]
-        if box is not None:
-            camera = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
         picture, mask = torch.from_numpy(color).float() / 255, torch.from_numpy(alpha).float() / 255
-        return View(picture, mask, camera, frame in self.generated)
+        return View(picture, mask, self.camera(frame), frame in self.generated)
+
+    def camera(self, frame: int) -> Camera:
+        """The crop's camera; the frame itself is not read."""
+        box, camera = self.box, self.cameras[frame]
+        if box is None:
+            return camera
+        return camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
 
     def _load(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         color, alpha = read_frame(self.folder / "frames", frame), read_mask(self.folder / "masks", frame)
@@ -97,44 +90,6 @@ class Frames:
             return color, alpha
         rows, columns = slice(self.box.top, self.box.bottom), slice(self.box.left, self.box.right)
         return np.ascontiguousarray(color[rows, columns]), np.ascontiguousarray(alpha[rows, columns])
-
-
-def person_box(folder: Path, frames: tuple[int, ...], margin: int) -> Box:
-    """The smallest box that holds the person in all the given frames, and a margin.
-
-    It is at least as large as SSIM's window.
-
-    Raises:
-        UserError: if no mask shows anybody, or the frames are smaller than SSIM's window.
-    """
-    columns, rows = np.zeros(0, bool), np.zeros(0, bool)
-    for frame in frames:
-        person = np.asarray(read_mask(folder / "masks", frame) >= FAINTEST)
-        columns = _either(columns, np.any(person, axis=0))
-        rows = _either(rows, np.any(person, axis=1))
-    if not columns.any():
-        raise UserError(f"{folder / 'masks'} shows nobody in the training frames; check the footage")
-    if min(len(columns), len(rows)) < WINDOW:
-        raise UserError(f"{folder / 'frames'}: frames must be at least {WINDOW} pixels wide and high")
-    left, right = _extent(columns, margin)
-    top, bottom = _extent(rows, margin)
-    return Box(left, top, right, bottom)
-
-
-def _either(known: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Marks of frames that may differ in size."""
-    if len(known) < len(new):
-        known, new = new, known
-    return known | np.pad(new, (0, len(known) - len(new)))
-
-
-def _extent(marks: np.ndarray, margin: int) -> tuple[int, int]:
-    inside = np.flatnonzero(marks)
-    first, last = max(0, int(inside[0]) - margin), min(len(marks), int(inside[-1]) + 1 + margin)
-    if last - first < WINDOW:
-        first = max(0, min(first, len(marks) - WINDOW))
-        last = first + WINDOW
-    return first, last
 
 
 def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:

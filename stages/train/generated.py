@@ -30,8 +30,8 @@ class GeneratedFrames(Frames):
         return dataclasses.replace(super().__getitem__(frame), trust=trust)
 
 
-class BothFrames:
-    """Captured crops and generated frames behind one set of numbers; as ``Frames`` to whoever reads it.
+class BothFrames(Frames):
+    """Captured crops and generated frames behind one set of numbers.
 
     Attributes:
         captured, made: the two sources.
@@ -43,11 +43,18 @@ class BothFrames:
         """Reads nothing yet."""
         self.captured, self.made = captured, made
         self.generated = made.generated
-        self.cameras: dict[int, Camera] = {**captured.cameras, **made.cameras}
+        self.cameras = {**captured.cameras, **made.cameras}
 
     def __getitem__(self, frame: int) -> View:
         """The crop of a captured frame, or a generated frame."""
-        return (self.made if frame in self.generated else self.captured)[frame]
+        return self._of(frame)[frame]
+
+    def camera(self, frame: int) -> Camera:
+        """The camera of the crop or of the generated frame."""
+        return self._of(frame).camera(frame)
+
+    def _of(self, frame: int) -> Frames:
+        return self.made if frame in self.generated else self.captured
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import Frames
+from stages.train.gate import Gate
 from stages.train.objective import Evidence, Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
@@ -29,6 +30,7 @@ class Trainer:
     Attributes:
         avatar: what is trained.
         poses: the frames' poses, refined along the way.
+        gate: which of the avatar is seen often enough to be trained; None where nothing is gated.
         curve: what has happened so far.
         iteration: optimiser steps done.
     """
@@ -40,6 +42,7 @@ class Trainer:
         evidence: Evidence,
         settings: TrainSettings,
         network: Lpips | None = None,
+        gate: Gate | None = None,
     ):
         """Starts at iteration 0.
 
@@ -49,9 +52,11 @@ class Trainer:
             evidence: the training frames.
             settings: of the stage.
             network: LPIPS, if it has a weight.
+            gate: counts what is seen, and gates the rest; None leaves all of the avatar active.
         """
-        self.avatar, self.poses, self.settings = avatar, poses, settings
+        self.avatar, self.poses, self.settings, self.gate = avatar, poses, settings, gate
         self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
+        self.objective.watch = None if gate is None else gate.watch
         self.curve, self.iteration = Curve(), 0
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
         self._update_phase()
@@ -79,6 +84,8 @@ class Trainer:
             self._pose_optimizer.step()
         self.curve.count(values)
         self.iteration += 1
+        if self.gate is not None and self.gate.due(self.iteration):
+            self.gate.update()
         return values
 
     @property
@@ -134,7 +141,8 @@ class Trainer:
                     )
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        return {"avatar": self.avatar, "poses": self.poses}
+        modules: dict[str, torch.nn.Module] = {"avatar": self.avatar, "poses": self.poses}
+        return modules if self.gate is None else {**modules, "gate": self.gate}
 
     def _poses_move(self) -> bool:
         settings = self.settings
@@ -178,7 +186,7 @@ def describe(values: dict[str, float]) -> str:
 def point_values(trainer: Trainer, psnr_db: float | None) -> dict[str, float]:
     """What a point of the curve holds besides the loss terms."""
     values = {
-        "gaussians": float(len(trainer.avatar.surfaces[trainer.level].canonical)),
+        "gaussians": float(len(trainer.avatar.surface(trainer.level).canonical)),
         "learning_rate": trainer.settings.learning_rate
         * schedule.rate_factor(trainer.settings, trainer.iteration),
     }

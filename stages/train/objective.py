@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.avatar import Avatar, Decoded, Posed, Surface
 from pipeline.metrics import Lpips
-from pipeline.splat import render
+from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
 from stages.train.data import Frames, View
 from stages.train.face import face_loss, face_triangles, paste
@@ -20,6 +20,8 @@ from stages.train.regularisers import Regularisers
 from stages.train.settings import TrainSettings
 
 Terms = dict[str, Tensor]
+Watch = Callable[[Surface, int, FramePose, View, Tensor], None]
+"""What was rendered, which draw of the run, the pose, the frame, each Gaussian's blending weight."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Objective:
         avatar, poses: what is trained.
         evidence: what it is compared with.
         settings: the weights.
+        watch: told of every rendering, if there is one.
     """
 
     def __init__(
@@ -104,8 +107,8 @@ class Objective:
         if settings.face and evidence.texture is None:
             raise ValueError("the face term needs a texture")
         self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
-        self.network, self.regularisers = network, Regularisers(avatar, settings)
-        self._face = {id(surface): face_triangles(surface.canonical) for surface in avatar.surfaces}
+        self.network, self.regularisers = network, Regularisers(settings)
+        self.watch: Watch | None = None
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
         """The weighted terms, averaged over the frames of the step.
@@ -142,7 +145,10 @@ class Objective:
         settings, view = self.settings, self.evidence.views[draw.frame]
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
         posed = self._pose(decoded, pose, draw)
-        terms = {**self._photometric(posed, view, draw), **self.regularisers.posed(decoded, posed)}
+        rendering = render(posed.gaussians, view.camera)
+        if self.watch is not None:
+            self.watch(decoded.surface, draw.position, pose, view, rendering.weights)
+        terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
         if settings.face and not view.generated:
             terms["face"] = settings.face * self._face_term(decoded, posed, view)
         if settings.pose_change and poses_move and not view.generated:
@@ -152,10 +158,9 @@ class Objective:
     def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw) -> Posed:
         return self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, draw.noise, draw.time)
 
-    def _photometric(self, posed: Posed, view: View, draw: Draw) -> Terms:
+    def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
         """How the rendering differs from the frame, both over the drawn background."""
         settings = self.settings
-        rendering = render(posed.gaussians, view.camera)
         image = losses.over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
         if settings.mask_band:
@@ -176,5 +181,5 @@ class Objective:
         if self.evidence.texture is None:
             raise ValueError("the face term needs a texture")
         canonical, means = decoded.surface.canonical, posed.gaussians.means
-        chosen, texture = self._face[id(decoded.surface)], self.evidence.texture[: len(means)]
+        chosen, texture = face_triangles(canonical), decoded.surface.pick(self.evidence.texture)
         return face_loss(paste(view.camera, means, canonical.faces, chosen, texture), view.color, view.alpha)

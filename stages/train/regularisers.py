@@ -13,7 +13,7 @@ import scipy.spatial
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Avatar, Canonical, Decoded, Posed, Surface
+from pipeline.avatar import Canonical, Decoded, Posed, Surface
 from pipeline.avatar.canonical import HANDS
 from pipeline.avatar.sparse import SparsePair
 from stages.train import losses
@@ -58,13 +58,11 @@ class Undersides:
 
 
 class Regularisers:
-    """The weighted terms; what does not change during training is computed once."""
+    """The weighted terms; weights are computed once for each surface, until another takes its place."""
 
-    def __init__(self, avatar: Avatar, settings: TrainSettings):
+    def __init__(self, settings: TrainSettings):
         self.settings = settings
-        self._weights = {
-            id(surface): part_weights(surface.canonical, settings) for surface in avatar.surfaces
-        }
+        self._last: tuple[Surface, PartWeights] | None = None
 
     def static(self, decoded: Decoded) -> Terms:
         """What does not hang on the pose."""
@@ -116,7 +114,9 @@ class Regularisers:
         return terms
 
     def _of(self, surface: Surface) -> PartWeights:
-        return self._weights[id(surface)]
+        if self._last is None or self._last[0] is not surface:
+            self._last = surface, part_weights(surface.canonical, self.settings)
+        return self._last[1]
 
 
 def part_weights(canonical: Canonical, settings: TrainSettings) -> PartWeights:

@@ -10,23 +10,26 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Architecture, Avatar, Canonical, save_avatar
-from pipeline.avatar.residual import part_rows
+from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
 from pipeline.errors import UserError
 from pipeline.metrics import Lpips
+from pipeline.person import person_box
+from pipeline.plan import read_plan
 from pipeline.records import Split, read_cameras, read_footage, read_split
 from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
-from stages.train.data import Frames, person_box, spread
+from stages.train.data import Frames, spread
+from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
+from stages.train.obey import obey
 from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-from stages.train.visibility import Visibility, first_colors, measure, write_visibility
+from stages.train.visibility import ever_in_frame, fill_unseen, first_colors, with_surroundings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Inputs:
     @property
     def views(self) -> Frames:
         """Every frame that is learnt from, captured and generated."""
-        return BothFrames(self.crops, self.generated.views) if self.generated else self.crops  # type: ignore[return-value]
+        return BothFrames(self.crops, self.generated.views) if self.generated else self.crops
 
     @property
     def all_poses(self) -> Poses:
@@ -70,9 +73,9 @@ class Inputs:
 def run(context: Context) -> None:
     """Trains the avatar of one subject.
 
-    Publishes ``avatar.safetensors``, ``curve.parquet``, ``visibility.parquet`` and ``poses.parquet``
-    (the training frames' refined, all others as fitted). Goes on from ``context.work`` if a run of
-    the same settings and inputs was killed.
+    Publishes ``avatar.safetensors``, ``curve.parquet``, ``visibility.parquet``, ``gate.json`` and
+    ``poses.parquet`` (the training frames' refined, all others as fitted). Goes on from
+    ``context.work`` if a run of the same settings and inputs was killed.
 
     Raises:
         UserError: if the inputs do not go together, or training diverges.
@@ -82,20 +85,34 @@ def run(context: Context) -> None:
 
 
 def train_subject(context: Context) -> None:
-    """Reads the inputs, trains, and writes what is published."""
-    inputs, settings = read_inputs(context), context.settings
+    """Reads the inputs, trains what the plan calls for, and writes what is published."""
+    inputs = read_inputs(context)
+    settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
     refinement = PoseRefinement(inputs.all_poses, inputs.split.train)
     started = time.monotonic()
-    avatar, visibility, texture = prepare(inputs, refinement, settings, context)
+    avatar, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
-    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network)
+    gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
+    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network, gate)
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()
-    save_avatar(context.output / "avatar.safetensors", trainer.avatar)
-    write_poses(context.output / "poses.parquet", refinement.refined(inputs.poses.frames))
-    write_visibility(context.output / "visibility.parquet", visibility)
-    trainer.curve.write(context.output / "curve.parquet")
+    publish(trainer, inputs, context)
+
+
+def publish(trainer: Trainer, inputs: Inputs, context: Context) -> None:
+    """Writes the finished avatar and what is known of its making."""
+    avatar, output, vertices = trainer.avatar, context.output, len(inputs.body.v_template)
+    avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
+    if avatar.unseen == "base":
+        fill_unseen(avatar)
+    save_avatar(output / "avatar.safetensors", avatar)
+    write_poses(output / "poses.parquet", trainer.poses.refined(inputs.poses.frames))
+    trainer.curve.write(output / "curve.parquet")
+    if trainer.gate is None:
+        write_ungated(output, vertices)
+    else:
+        trainer.gate.write(output)
 
 
 def read_inputs(context: Context) -> Inputs:
@@ -123,53 +140,51 @@ def read_inputs(context: Context) -> Inputs:
 
 def prepare(
     inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context
-) -> tuple[Avatar, Visibility, Tensor | None]:
+) -> tuple[Avatar, Tensor | None]:
     """The untrained avatar: what to keep of the body, and its first colours.
 
     Returns:
-        The avatar, what the clip shows of the body, and the texture of the face loss, [N, 3]; None
-        where it has no weight.
+        The avatar, and the texture of the face loss, [N, 3]; None where it has no weight.
     """
-    chosen = spread(inputs.split.train, settings.gate_frames)
-    everything = torch.arange(len(inputs.body.v_template))
-    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0, scale=settings.scale)
-    body = Avatar(inputs.body, inputs.identity, everything, bare).eval()
-    body.pose_heads_active = False
-    made = spread(inputs.generated.frames, settings.gate_frames) if inputs.generated else ()
-    visibility = measure(body, refinement, inputs.views, chosen, settings.gate_rings, made)
-    if not bool((visibility.frames > 0).any()):
-        raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
-    if not settings.gate:
-        visibility = dataclasses.replace(visibility, kept=torch.ones_like(visibility.kept))
-    kept = torch.nonzero(visibility.kept)[:, 0]
-    sizes = architecture(settings, seen_parts(body.surfaces[0].canonical, visibility, settings))
-    avatar = Avatar(inputs.body, inputs.identity, kept, sizes, settings.seed, settings.half_precision)
+    kept = keep(inputs, refinement, settings, context)
+    # What is shown in its base colours in the end belongs to the avatar, though it is never trained.
+    rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
+    body, identity, sizes = inputs.body, inputs.identity, architecture(settings)
+    avatar = Avatar(body, identity, rows, sizes, settings.seed, settings.half_precision)
     avatar.pose_heads_active = avatar.residuals_active = False
     set_time_range(avatar, inputs)
-    seen = float((visibility.frames > 0).float().mean())
-    context.log(
-        f"{seen:.0%} of the body is seen, {len(kept)} of {len(everything)} vertices are kept, "
-        f"{len(avatar)} Gaussians; residual colours of: {', '.join(sizes.residual_parts) or 'no part'}"
-    )
     texture = None
     if settings.initial_color or settings.face:
+        chosen = spread(inputs.split.train, settings.color_frames)
+        made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
         logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)
-    return avatar.train(), visibility, texture
+    avatar.gate(kept[rows])
+    parts = ", ".join(region.part for region in avatar.surface().residual) or "no part"
+    context.log(
+        f"{int(kept.sum())} of {len(kept)} body vertices are kept, {len(avatar)} Gaussians; "
+        f"residual colours of: {parts}"
+    )
+    return avatar.train(), texture
 
 
-def seen_parts(canonical: Canonical, visibility: Visibility, settings: TrainSettings) -> tuple[str, ...]:
-    """The parts that get a residual head: of those wanted, the ones that the clip shows enough of."""
-    if settings.residual_from == 1:
-        return ()
-    seen = visibility.frames > 0
-    shares = {
-        part: float(seen[rows].float().mean())
-        for part, rows in part_rows(canonical, settings.residual_parts).items()
-    }
-    return tuple(part for part, share in shares.items() if 0 < share >= settings.residual_seen)
+def keep(inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context) -> Tensor:
+    """The body vertices that get a Gaussian to begin with, [V] bool.
+
+    Raises:
+        UserError: no training frame has any of the body in its picture.
+    """
+    everything = torch.arange(len(inputs.body.v_template))
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    body = Avatar(inputs.body, inputs.identity, everything, bare)
+    seen = ever_in_frame(body, refinement, inputs.crops, inputs.split.train)
+    if not bool(seen.any()):
+        raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
+    if not (settings.gate and settings.early_gate):
+        return torch.ones_like(seen)
+    return with_surroundings(body, seen, settings.gate_rings)
 
 
 def set_time_range(avatar: Avatar, inputs: Inputs) -> None:
@@ -179,16 +194,17 @@ def set_time_range(avatar: Avatar, inputs: Inputs) -> None:
         avatar.residuals.time_range.copy_(torch.tensor([min(times), max(times)]))
 
 
-def architecture(settings: TrainSettings, residual_parts: tuple[str, ...]) -> Architecture:
+def architecture(settings: TrainSettings) -> Architecture:
     """The part of the settings that an avatar's file has to remember."""
-    names = [field.name for field in dataclasses.fields(Architecture)]
+    names = [field.name for field in dataclasses.fields(Architecture) if field.name != "pose_heads"]
     remembered = {name: getattr(settings, name) for name in names}
-    return Architecture(**{**remembered, "residual_parts": residual_parts})
+    remembered["residual_parts"] = () if settings.residual_from == 1 else settings.residual_parts
+    return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
 
 
 def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     """Runs the iterations that are left, with checkpoints and points of the curve."""
-    settings = context.settings
+    settings = trainer.settings
     poses = inputs.all_poses
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)

@@ -10,16 +10,20 @@ from typing import Any
 # originals in pipeline/avatar/residual.py and pipeline/metrics/lpips.py.
 NETWORKS = ("alex", "vgg")
 PLACES = ("canonical", "posed")
+DEFINITIONS = ("in_frame", "contributes")
+GUARDS = ("evidence", "authors")
+UNSEEN = ("nothing", "base", "generated")
 PARTS = (
     "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg",
     "rest",
 )  # fmt: skip
 COUNTS = (
-    "iterations", "batch", "held_out_every", "checkpoint_every", "gate_frames", "groups", "lpips_every",
+    "iterations", "batch", "held_out_every", "checkpoint_every", "color_frames", "gate_every", "groups",
+    "lpips_every",
     "plane_channels", "width", "residual_width",
 )  # fmt: skip
 FRACTIONS = (
-    "subdivide_from", "pose_heads_from", "refine_from", "residual_from", "residual_seen", "time_dropout",
+    "subdivide_from", "pose_heads_from", "refine_from", "residual_from", "gate_from", "time_dropout",
     "final_rate",
 )  # fmt: skip
 AMOUNTS = (
@@ -62,8 +66,9 @@ class TrainSettings:
     # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
     pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices
     initial_color: bool = True  # colours start at what the training frames show, else at grey
+    color_frames: int = 24  # training frames that first colours are looked for in
 
-    # Residual colours (Section 3.5). A part without a vertex that the gate saw gets no head.
+    # Residual colours (Section 3.5). A part that the plan does not name gets no head.
     residual_parts: tuple[str, ...] = ("face", "left_hand", "right_hand")  # "rest": the authors' fourth net
     residual_from: float = 0.5  # fraction of the run from which the residual heads take part; 1: never
     residual_width: int = 64  # hidden channels; the authors' release has 256
@@ -71,12 +76,19 @@ class TrainSettings:
     place_frequencies: int = 6  # of that place's encoding, in the part's box ("posed": metres)
     time_frequencies: int = 6  # of the time's encoding, over the training frames' interval
     time_dropout: float = 0.2  # share of draws without a time, for motion that has none
-    residual_seen: float = 0.1  # share of a part's vertices that the gate must see for it to get a head
 
-    # Visibility gate
-    gate: bool = True  # leave out what no training frame shows
-    gate_frames: int = 24  # training frames that the gate looks at
-    gate_rings: int = 2  # rings of neighbours added to what was seen
+    # Visibility gate (Section 3.4); it acts only if the plan calls for it
+    gate: bool = True  # leave out what is seen too seldom
+    early_gate: bool = True  # from the start: what lies in no training frame's picture
+    gate_from: float = 0.1  # fraction of the run, the warm-up, after which scores are looked at; 1: never
+    gate_every: int = 50  # iterations between looks
+    gate_definition: str = "in_frame"  # what counts as seen: in_frame, or contributes to the rendering
+    gate_threshold: float | None = None  # scores below are gated; none: found in the scores (Otsu)
+    gate_guard: str = "evidence"  # when Otsu is believed: evidence, or as in the authors' release: authors
+    gate_rings: int = 2  # rings of neighbours added to what is left
+    # What a finished avatar shows where no captured frame showed enough: nothing, base (the fitted body in
+    # the colours next to it), or generated (what generated frames show, and nothing where there are none)
+    unseen: str = "generated"
 
     # Optimiser
     learning_rate: float = 1e-3  # of the heads
@@ -136,7 +148,13 @@ class TrainSettings:
             ("residual_width",), lambda value: value % self.groups == 0, "be divisible by train.groups"
         )
         self._require(("lpips_network",), lambda value: value in NETWORKS, f"be one of {', '.join(NETWORKS)}")
-        self._require(("residual_place",), lambda value: value in PLACES, f"be one of {', '.join(PLACES)}")
+        words = {
+            "residual_place": PLACES, "gate_definition": DEFINITIONS, "gate_guard": GUARDS, "unseen": UNSEEN,
+        }  # fmt: skip
+        for name, known in words.items():
+            self._require((name,), lambda value, known=known: value in known, f"be one of {', '.join(known)}")
+        if self.gate_threshold is not None:
+            self._require(("gate_threshold",), lambda value: 0 < value <= 1, "lie between 0 and 1")
         self._require(
             ("residual_parts",), lambda value: {*value} <= {*PARTS}, f"hold only {', '.join(PARTS)}"
         )

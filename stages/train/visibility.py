@@ -1,130 +1,65 @@
-"""What the training frames show of the body: which vertices to keep, and their first colours.
+"""What the training frames show of the body before training: which vertices to keep, and their colours.
 
-A clip of a head says nothing about the feet. Before training, the fitted body is rendered in some
-training frames; what none of them shows, and is not next to something shown, gets no Gaussian at
-all (the idea of the paper's Section 3.4, applied once and early).
+A clip of a head says nothing about the feet. Where no training frame has a vertex in its picture, the
+score of the paper's Section 3.4 is zero whatever training does, and the gate (``gate.py``) would take it
+out after the warm-up; so it gets no Gaussian to begin with. That saves the warm-up's time, and the
+triplane is fitted to what is left.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
 import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.camera import project
+from pipeline.avatar.sparse import SparsePair
 from pipeline.splat import Gaussians, render
-from pipeline.tables import write_table
-from stages.train.data import Frames, View
+from pipeline.visibility import body_in_frame
+from stages.train.data import Frames
 from stages.train.losses import trust
 from stages.train.poses import PoseRefinement
 
-SCHEMA = pa.schema(
-    [
-        ("vertex", pa.int32()),
-        ("frames", pa.int32()),
-        ("weight", pa.float32()),
-        ("kept", pa.bool_()),
-        ("generated", pa.int32()),
-    ]
-)
 DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
 BELIEVED = 0.5  # trust from which a pixel has a say in first colours
 SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
 
 
-@dataclasses.dataclass(frozen=True)
-class Visibility:
-    """Evidence for each body vertex.
-
-    Attributes:
-        looked_at: how many frames were rendered.
-        frames: [V] int64, in how many of them the vertex contributed to the image.
-        weight: [V], its blending weight summed over pixels and frames.
-        kept: [V] bool, whether it carries a Gaussian.
-        generated: [V] int64, in how many generated frames it contributed; counted apart, so that what a
-            model made up never passes for something that was seen. All zero if not given.
-    """
-
-    looked_at: int
-    frames: Tensor  # [V]
-    weight: Tensor  # [V]
-    kept: Tensor  # [V]
-    generated: Tensor = None  # type: ignore[assignment]  # [V]; never None once it is made
-
-    def __post_init__(self) -> None:
-        """Without generated frames nothing is seen in them."""
-        if self.generated is None:
-            object.__setattr__(self, "generated", torch.zeros_like(self.frames))
-
-
-def measure(
-    avatar: Avatar,
-    poses: PoseRefinement,
-    views: Frames,
-    chosen: tuple[int, ...],
-    rings: int,
-    made: tuple[int, ...] = (),
-) -> Visibility:
-    """Renders the fitted body in the chosen frames.
+def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: tuple[int, ...]) -> Tensor:
+    """The body vertices that lie in the picture of at least one of the frames, [K] bool.
 
     Args:
-        avatar: untrained, unsubdivided and with every body vertex.
+        avatar: untrained.
         poses: of every frame.
         views: the cameras.
-        chosen: frame numbers.
-        rings: of neighbours that are kept with what was seen.
-        made: numbers of generated frames, in which a vertex may be seen as well.
+        frames: frame numbers.
     """
-    frames, weight = _counted(avatar, poses, views, chosen)
-    generated = _counted(avatar, poses, views, made)[0]
-    kept = dilate((frames > 0) | (generated > 0), avatar.surfaces[0].canonical.faces, rings)
-    return Visibility(len(chosen), frames, weight, kept, generated)
+    seen = torch.zeros(len(avatar.kept), dtype=torch.bool)
+    for frame in frames:
+        pose = poses.fitted(frame)
+        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, views.camera(frame))
+    return seen
 
 
-@torch.no_grad()
-def _counted(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]
-) -> tuple[Tensor, Tensor]:
-    """In how many frames each vertex contributed, and its blending weight over all of them, [V] each.
-
-    In a generated frame only what lies within its mask counts: it is cropped to what the clip frames.
-    """
-    frames, weight = torch.zeros(len(avatar), dtype=torch.long), torch.zeros(len(avatar))
-    for frame in chosen:
-        view, gaussians = views[frame], _gaussians(avatar, poses, frame)
-        rendering = render(gaussians, view.camera)
-        seen = rendering.weights > 0
-        if view.generated:
-            seen &= _within(view, gaussians.means)
-        frames += seen
-        weight += rendering.weights
-    return frames, weight
+def with_surroundings(avatar: Avatar, seen: Tensor, rings: int) -> Tensor:
+    """What is seen and ``rings`` rings of neighbours: what offsets and refined poses may bring in."""
+    return dilate(seen, avatar.surfaces[0].canonical.faces, rings)
 
 
-def _within(view: View, points: Tensor) -> Tensor:
-    """Whether points fall on the person in a frame, [N, 3] -> [N] bool."""
-    columns, rows = project(view.camera, points).floor().long().unbind(1)
-    inside = (columns >= 0) & (rows >= 0) & (columns < view.camera.width) & (rows < view.camera.height)
-    place = rows.clamp(0, view.camera.height - 1), columns.clamp(0, view.camera.width - 1)
-    return inside & (view.alpha[place] > 0.5)
-
-
-def write_visibility(path: Path, visibility: Visibility) -> None:
-    """Writes ``visibility.parquet``: a row a body vertex."""
-    columns = {
-        "vertex": np.arange(len(visibility.frames)),
-        "frames": visibility.frames.numpy(),
-        "weight": visibility.weight.numpy(),
-        "kept": visibility.kept.numpy(),
-        "generated": visibility.generated.numpy(),
-    }
-    write_table(path, SCHEMA, columns)
+def fill_unseen(avatar: Avatar) -> None:
+    """Gives what is gated the colours of what is next to it, for ``Avatar.unseen = "base"``."""
+    full, surface = avatar.surfaces[-1], avatar.surface()
+    if surface.rows is None:
+        return
+    with torch.no_grad():
+        color = torch.zeros(len(full.canonical), 3)
+        color[surface.rows] = torch.sigmoid(avatar.decode().color_logit)
+        known = torch.zeros(len(color), 1)
+        known[surface.rows] = 1
+        filled = torch.logit(fill(color, known, full.neighbours).clamp(DARKEST, BRIGHTEST))
+        avatar.base_color.copy_(torch.where(known > 0, avatar.base_color, filled))
 
 
 def first_colors(
@@ -156,7 +91,7 @@ def first_colors(
         unseen = weight == 0
         total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
     neighbours = avatar.surfaces[-1].neighbours
-    return torch.logit(_fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+    return torch.logit(fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
 
 
 def _shown(
@@ -182,8 +117,8 @@ def _shown(
     return total, weight
 
 
-def _fill(total: Tensor, weight: Tensor, neighbours) -> Tensor:
-    """Mean colours; what has no weight takes those of its neighbours, then the overall mean."""
+def fill(total: Tensor, weight: Tensor, neighbours: SparsePair) -> Tensor:
+    """Mean colours, [N, 3]; what has no weight takes those of its neighbours, then the overall mean."""
     known = (weight > 0).float()
     color = total / weight.clamp_min(1e-12) * known
     overall = total.sum(0) / weight.sum().clamp_min(1e-12)

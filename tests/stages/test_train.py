@@ -13,17 +13,20 @@ from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.plan import read_plan
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import losses, visibility
+from stages.train import losses
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
+from stages.train.gate import SCHEMA, Gate
 from stages.train.loop import Trainer
+from stages.train.obey import obey
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
 READERS = ((read_frame, "frames"), (read_mask, "masks"))
 RED = np.array([255, 0, 0], np.uint8)
-PUBLISHED = {"avatar.safetensors", "curve.parquet", "poses.parquet", "visibility.parquet"}
+PUBLISHED = {"avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet"}
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +46,11 @@ def finished(subject):
 
 def trainer_for(context) -> Trainer:
     inputs = stage.read_inputs(context)
+    settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
     refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
-    avatar, _, texture = stage.prepare(inputs, refinement, context.settings, context)
-    return Trainer(avatar, refinement, inputs.evidence(texture), context.settings)
+    avatar, texture = stage.prepare(inputs, refinement, settings, context)
+    gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
+    return Trainer(avatar, refinement, inputs.evidence(texture), settings, gate=gate)
 
 
 def bytes_of(folder) -> dict[str, bytes]:
@@ -155,7 +160,8 @@ def test_first_colors_are_near_the_truth(subject, tmp_path):
 
 def test_first_colours_leave_out_what_a_wide_mask_takes_from_the_background(subject, tmp_path):
     shutil.copytree(subject / "ingest", tmp_path / "ingest")
-    (tmp_path / "fit").symlink_to(subject / "fit")
+    for name in ("fit", "plan"):
+        (tmp_path / name).symlink_to(subject / name)
     for frame in range(6):
         picture, mask = (read(tmp_path / "ingest" / name, frame) for read, name in READERS)
         write_frame(tmp_path / "ingest" / "frames", frame, np.where(mask[..., None] < 64, RED, picture))
@@ -165,18 +171,20 @@ def test_first_colours_leave_out_what_a_wide_mask_takes_from_the_background(subj
         context = context_for(tmp_path, tmp_path / f"out{band}", mask_band=band)
         inputs = stage.read_inputs(context)
         refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
-        avatar, seen, _ = stage.prepare(inputs, refinement, context.settings, context)
+        avatar, _ = stage.prepare(inputs, refinement, context.settings, context)
         truth = torch.sigmoid(2 * torch.sin(9 * inputs.body.v_template[avatar.kept]))
-        change = (torch.sigmoid(avatar.base_color) - truth)[seen.frames[avatar.kept] > 0]
+        change = (torch.sigmoid(avatar.base_color) - truth)[
+            stage.ever_in_frame(avatar, refinement, inputs.crops, inputs.split.train)
+        ]
         reddened.append(float((change[:, 0] - change[:, 1:].mean(1) > 0.2).float().mean()))
     assert 0.01 < reddened[0] and reddened[1] < 0.25 * reddened[0]
 
 
 def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
-    table = read_table(finished / "visibility.parquet", visibility.SCHEMA, "")
-    seen, kept = table["frames"] > 0, table["kept"]
-    assert kept[seen].all() and seen.sum() < kept.sum() < len(kept) / 2
-    assert np.array_equal(table["weight"] > 0, seen)
+    table = read_table(finished / "visibility.parquet", SCHEMA, "")
+    seen, kept = table["captured"] > 0, table["kept"]
+    assert kept[seen].all() and 0 < seen.sum() < kept.sum() < len(kept) / 2
+    assert not table["generated"].any() and not (table["early"] & kept).any()
     body = load_body(BODY_FILE)
     assert body.v_template[~torch.from_numpy(kept), 1].min() < -1  # the feet are gone
     context = context_for(subject, tmp_path / "open", gate=False)
@@ -227,8 +235,6 @@ def test_residuals_can_be_left_out(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "never", residual_from=1.0))
     assert not trainer.avatar.residuals.heads
     assert "residual_size" not in trainer.step()
-    unseen = trainer_for(context_for(subject, tmp_path / "unseen", residual_seen=1.0))
-    assert not unseen.avatar.residuals.heads
 
 
 def test_residuals_begin_when_they_are_told_to(subject, tmp_path):
@@ -271,7 +277,8 @@ def altered(subject, folder, change):
     (folder / "fit").mkdir(parents=True)
     for path in (subject / "fit").iterdir():
         (folder / "fit" / path.name).write_bytes(path.read_bytes())
-    (folder / "ingest").symlink_to(subject / "ingest")
+    for name in ("ingest", "plan"):
+        (folder / name).symlink_to(subject / name)
     write_poses(folder / "fit" / "poses.parquet", change(read_poses(subject / "fit" / "poses.parquet")))
     return context_for(folder, folder / "out")
 

@@ -14,9 +14,11 @@ from pipeline.avatar import Architecture, Avatar
 from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
 from pipeline.camera import facing_camera
 from pipeline.frames import write_frame, write_mask
+from pipeline.plan import write_plan
 from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import render
 from stages.train.settings import TrainSettings
+from tests.plans import plan_of
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
 FRAMES, WIDTH, HEIGHT = 6, 48, 64
@@ -30,7 +32,9 @@ TINY = TrainSettings(
     width=16,
     groups=4,
     subdivisions=0,
-    gate_frames=3,
+    color_frames=3,
+    gate_from=0.25,
+    gate_every=2,
     residual_from=0.3,
     face=0.8,
     mask_band=1,
@@ -50,9 +54,9 @@ def moving_poses(count: int = FRAMES) -> Poses:
 
 
 def write_subject(folder: Path) -> None:
-    """Writes ``ingest`` and ``fit`` as those stages would publish them."""
-    ingest, fit = folder / "ingest", folder / "fit"
-    for made in (ingest / "frames", ingest / "masks", fit):
+    """Writes ``ingest``, ``fit`` and ``plan`` as those stages would publish them."""
+    ingest, fit, plan = folder / "ingest", folder / "fit", folder / "plan"
+    for made in (ingest / "frames", ingest / "masks", fit, plan):
         made.mkdir(parents=True)
     body, poses = load_body(BODY_FILE), moving_poses()
     identity = mean_identity(body)
@@ -74,6 +78,8 @@ def write_subject(folder: Path) -> None:
     write_split(ingest / "split.json", Split(train=poses.frames[:-1], test=poses.frames[-1:]))
     write_identity(fit / "identity.safetensors", identity, body)
     write_poses(fit / "poses.parquet", poses)
+    unseen = {"left_hand_residual": False, "right_hand_residual": False}  # they hang below the picture
+    write_plan(plan / "plan.json", plan_of(**unseen))
 
 
 def context_for(folder: Path, output: Path, work: Path | None = None, **changes):
@@ -88,7 +94,7 @@ def context_for(folder: Path, output: Path, work: Path | None = None, **changes)
 
     return SimpleNamespace(
         settings=dataclasses.replace(TINY, **changes),
-        inputs={"ingest": folder / "ingest", "fit": folder / "fit"},
+        inputs={name: folder / name for name in ("ingest", "fit", "plan")},
         body_file=BODY_FILE,
         output=output,
         work=work,

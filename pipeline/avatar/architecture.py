@@ -1,0 +1,44 @@
+"""The sizes of an avatar."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """Everything that must be known to rebuild an avatar's networks; stored in its file.
+
+    Attributes:
+        plane_resolution: texels along a side of each plane.
+        plane_channels: features a texel; three planes give ``f_i`` three times as many.
+        width: hidden channels of the heads.
+        groups: of GroupNorm in the heads.
+        subdivisions: levels of midpoint subdivision of the body mesh.
+        offset_unit, pose_offset_unit: metres that a head's output of 1 stands for.
+        scale: initial standard deviation along the surface, in distances to the neighbours.
+        thickness: initial standard deviation along the normal, in those along the surface.
+        opacity: of every Gaussian.
+        residual_parts: parts that have a residual colour head, if any of their vertices is kept.
+        residual_width: hidden channels of those heads.
+        residual_place: which place they are told, ``"canonical"`` or ``"posed"`` (see ``residual.py``).
+        place_frequencies, time_frequencies: of the encodings of that place and of the time.
+        pose_heads: whether there are any; one who never moves needs none.
+    """
+
+    plane_resolution: int = 128
+    plane_channels: int = 32
+    width: int = 128
+    groups: int = 8
+    subdivisions: int = 1
+    offset_unit: float = 0.02
+    pose_offset_unit: float = 0.01
+    scale: float = 0.55
+    thickness: float = 0.5
+    opacity: float = 0.999
+    residual_parts: tuple[str, ...] = ()
+    residual_width: int = 64
+    residual_place: str = "canonical"
+    place_frequencies: int = 6
+    time_frequencies: int = 6
+    pose_heads: bool = True

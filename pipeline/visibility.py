@@ -1,0 +1,186 @@
+"""How often each point of the body is seen, and where the line is drawn (paper, Section 3.4).
+
+A score v_i is the share of the frames that show vertex i. The paper draws the line at Otsu's threshold
+tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu
+draws a line all the same, through what is healthy. ``evidence_threshold`` tells the two apart by what a
+line costs; ``authors_threshold`` is the test of the authors' release, for comparison.
+
+**The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
+frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /
+sum of all scores``. A line is drawn only where
+
+1. ``lost`` is at most ``LARGEST_LOSS``: no more is taken from what the clip shows;
+2. a valley lies there: scores between tau / 2 and 3 tau / 2 are at most ``LARGEST_VALLEY`` of those under
+   tau. This is the paper's own argument for Otsu, that the line could be moved without harm;
+3. at least ``LEAST_CUT`` of all vertices lie under it, else it is not worth its bookkeeping.
+
+Where Otsu's own line fails, Otsu is asked again about the scores under it, and so on: with three modes
+(legs never, hands now and then, the face always) the first line may cut off the hands, and the second
+one leaves them.
+
+The guards of the authors' release are mu_0 < 0.10, the mean of the lower class; eta >= 0.60, the share of
+the variance that lies between the classes; and 5% to 95% of the vertices under the line. The second one
+stops nothing: a normal distribution has eta = 2 / pi = 0.64 and a uniform one 0.75. The first one does
+the work, and asks for the mean of a class in which never-seen vertices outvote the others: whether hands
+that half of the frames show are cut off then hangs on how many legs are out of the picture.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Surface
+from pipeline.body import joint_transforms
+from pipeline.camera import Camera, project, to_camera
+
+BINS = 256
+NEAR = 0.2  # metres: what is nearer to the camera is not in the picture, as in the authors' release
+LARGEST_LOSS, LARGEST_VALLEY, LEAST_CUT = 0.01, 0.1, 0.05
+LARGEST_LOW_MEAN, LEAST_SEPARABILITY, CUT_RANGE = 0.10, 0.60, (0.05, 0.95)  # the authors' guards
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A threshold on scores and what it means.
+
+    Attributes:
+        tau: scores below it are gated; 0 where the gate stays open.
+        otsu: tau* of the whole histogram, whether it is used or not.
+        separability: eta at tau*.
+        low_mean: mu_0 at tau*, the mean score under it.
+        cut: the share of the vertices under ``tau``, or under ``otsu`` where the gate stays open.
+        lost: the part of what the frames show that goes missing with them.
+        why: one sentence.
+    """
+
+    tau: float
+    otsu: float
+    separability: float
+    low_mean: float
+    cut: float
+    lost: float
+    why: str
+
+    @property
+    def closed(self) -> bool:
+        """Whether anything is gated."""
+        return self.tau > 0
+
+
+def in_frame(camera: Camera, points: Tensor) -> Tensor:
+    """Which points lie inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
+    pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
+    size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype)
+    return (depth > NEAR) & ((pixels >= 0) & (pixels < size)).all(1)
+
+
+@torch.no_grad()
+def body_in_frame(surface: Surface, rotation: Tensor, transl: Tensor, camera: Camera) -> Tensor:
+    """Which vertices of the posed body lie in the picture, [N] bool.
+
+    Expressions and offsets are left out: they move a vertex by less than its distance to the next.
+
+    Args:
+        surface: of an avatar.
+        rotation: [55, 3] rotation vectors, radians.
+        transl: [3], metres.
+        camera: of the picture.
+    """
+    canonical = surface.canonical
+    transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
+    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, transl)[0])
+
+
+def histogram(scores: np.ndarray) -> np.ndarray:
+    """How many scores, [V] in [0, 1], lie in each of ``BINS`` equal bins: [256] int64."""
+    return np.bincount(np.minimum((scores * BINS).astype(np.int64), BINS - 1), minlength=BINS)
+
+
+def otsu(counts: np.ndarray) -> tuple[float, float, float]:
+    """Otsu's threshold of a histogram over [0, 1].
+
+    Where several lines separate equally well, which is so across every gap, the middle one is taken.
+
+    Args:
+        counts: [256], not all zero.
+
+    Returns:
+        tau*, the separability eta in [0, 1] and the mean mu_0 of the lower class; 0, 0, 0 where all
+        scores lie in one bin.
+    """
+    share = counts / counts.sum()
+    centres = (np.arange(len(counts)) + 0.5) / len(counts)
+    low, first = np.cumsum(share)[:-1], np.cumsum(share * centres)[:-1]
+    mean = float((share * centres).sum())
+    variance = float((share * (centres - mean) ** 2).sum())
+    inner = (low > 0) & (low < 1 - 1e-12)
+    if not inner.any():
+        return 0.0, 0.0, 0.0
+    between = np.zeros(len(low))
+    between[inner] = (mean * low[inner] - first[inner]) ** 2 / (low[inner] * (1 - low[inner]))
+    best = np.flatnonzero(between >= between.max() * (1 - 1e-6))
+    line = int(best[len(best) // 2])
+    return (line + 1) / len(counts), float(between.max() / variance), float(first[line] / low[line])
+
+
+def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Line:
+    """Where to draw the line, if anywhere, by the test of the module's docstring.
+
+    Args:
+        scores: [V] in [0, 1], of every vertex of the body.
+        largest_loss: see there.
+    """
+    tau, separability, low_mean = otsu(histogram(scores))
+    first = tau
+    while tau > 0:
+        cut, lost = cost(scores, tau)
+        if cut < LEAST_CUT:
+            break
+        valley = float(((scores >= tau / 2) & (scores < 1.5 * tau)).mean())
+        if lost <= largest_loss and valley <= LARGEST_VALLEY * cut:
+            why = f"{cut:.0%} of the body is under {tau:.2f}, and {lost:.2%} of what is seen goes with it"
+            return Line(tau, first, separability, low_mean, cut, lost, why)
+        tau = otsu(histogram(scores[scores < tau]))[0]
+    cut, lost = cost(scores, first)
+    return Line(0.0, first, separability, low_mean, cut, lost, _why_open(first, cut, lost))
+
+
+def _why_open(tau: float, cut: float, lost: float) -> str:
+    if tau == 0:
+        return "all of the body is seen equally often"
+    if cut < LEAST_CUT:
+        return f"only {cut:.1%} of the body is seen less often than the rest"
+    return f"a line at {tau:.2f} would take {lost:.1%} of what is seen, and there is no valley under it"
+
+
+def authors_threshold(scores: np.ndarray) -> Line:
+    """Otsu's line, where the guards of the authors' release let it pass."""
+    tau, separability, low_mean = otsu(histogram(scores))
+    cut, lost = cost(scores, tau)
+    failed = [
+        text
+        for fails, text in (
+            (low_mean >= LARGEST_LOW_MEAN, f"mu_0 = {low_mean:.2f}"),
+            (separability < LEAST_SEPARABILITY, f"eta = {separability:.2f}"),
+            (not CUT_RANGE[0] <= cut <= CUT_RANGE[1], f"{cut:.1%} cut"),
+        )
+        if fails
+    ]
+    why = f"open: {', '.join(failed)}" if failed else "mu_0, eta and the cut pass"
+    return Line(0.0 if failed else tau, tau, separability, low_mean, cut, lost, why)
+
+
+def fixed_threshold(scores: np.ndarray, tau: float) -> Line:
+    """A line drawn by hand."""
+    first, separability, low_mean = otsu(histogram(scores))
+    return Line(tau, first, separability, low_mean, *cost(scores, tau), "set by hand")
+
+
+def cost(scores: np.ndarray, tau: float) -> tuple[float, float]:
+    """The share of vertices under a line, and the part of what is seen that goes missing with them."""
+    under, total = scores < tau, float(scores.sum())
+    return float(under.mean()), float(scores[under].sum()) / total if total else 0.0

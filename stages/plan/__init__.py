@@ -1,0 +1,16 @@
+"""plan: which effects this scene calls for, each with the number that decided it."""
+
+from pipeline.stage import Stage
+from stages.plan.settings import PlanSettings
+
+STAGE = Stage(
+    name="plan",
+    version=1,
+    settings=PlanSettings,
+    run="stages.plan.run:run",
+    needs={
+        "ingest": ("keypoints.parquet", "masks/*", "cameras.parquet", "split.json", "footage.json"),
+        "fit": ("identity.safetensors", "poses.parquet", "residuals.parquet", "face.json"),
+    },
+    reads_body=True,
+)

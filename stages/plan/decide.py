@@ -1,0 +1,172 @@
+"""From numbers to decisions. The thresholds were chosen on mannequins, whose content is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.body import rest_joints
+from pipeline.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
+from pipeline.visibility import LEAST_CUT, evidence_threshold
+from stages.plan.measure import (
+    Clip,
+    mean_error,
+    part_pixels,
+    pose_change,
+    unseen_azimuths,
+    visibility,
+)
+from stages.plan.settings import PlanSettings
+
+# As in stages/ingest/cameras/motion.py, which is where it decides; a test compares them.
+BACKGROUND_MOTION = 0.03
+
+# Share of a part's vertices. Mannequins: what a framing shows reaches 0.4 and more, what it does not 0.
+PART_SEEN = 0.1
+
+# Pixels across. Hands of the full mannequin (21 to 23) and its face (24) hold fewer pixels than Gaussians
+# stand there: nothing finer is left to add. The upper mannequin's hand has 76, its face 72.
+RESIDUAL_PIXELS = 32.0
+
+# Degrees. A mannequin that stands still is fitted to within 1.3; the least moving one that moves has 9.
+POSE_CHANGE = 2.0
+
+# Degrees of the widest unseen range. Skin turned away by up to 60 degrees is still seen well, so that a
+# range of 120 is covered from its two sides.
+UNSEEN_RANGE = 120.0
+
+FIT_PIXELS = 0.25  # under a quarter of a pixel there is nothing left to refine
+HELD_OUT_PIXELS = 4.0  # of mean error: beyond, held-out scores judge the fit rather than the avatar
+
+
+def decide(clip: Clip, settings: PlanSettings) -> Plan:
+    """The plan of a clip."""
+    scores, seen = visibility(clip)
+    decisions = [
+        structure_from_motion(clip),
+        face_registration(clip),
+        *(part_seen(part, seen) for part in SEEN_PARTS),
+        gate(scores),
+        azimuths(clip),
+        poses_follow(clip),
+        refinement(clip),
+        test_time(clip),
+    ]
+    made = {one.effect: forced(one, settings) for one in decisions}
+    for part in ("face", "left_hand", "right_hand"):
+        made[f"{part}_residual"] = forced(residual(clip, part, made[f"seen_{part}"].on), settings)
+    made["face_loss"] = forced(face_loss(clip, made), settings)
+    return Plan(tuple(made[name] for name in EFFECTS))
+
+
+def forced(decision: Decision, settings: PlanSettings) -> Decision:
+    """A decision after its setting was heard."""
+    if decision.effect in GATHERED:
+        return decision
+    choice = getattr(settings, decision.effect)
+    if choice == "auto":
+        return decision
+    why = f"set by plan.{decision.effect}={choice}; by itself: {decision.why}"
+    return dataclasses.replace(decision, on=choice == "on", why=why, forced=True)
+
+
+def structure_from_motion(clip: Clip) -> Decision:
+    """What ingest decided about the cameras."""
+    record = clip.footage.camera
+    source, moved = record.get("source", "known"), record.get("displacement")
+    on = source in ("sfm", "rotation")
+    if moved is not None:
+        why = f"the background moves by {moved:.2%} of the picture in a second, so the camera " + (
+            "is found from it" if on else "counts as static"
+        )
+    else:
+        why = "ingest.cameras asked for it" if on else "the cameras are given, not found"
+    as_measured = moved is not None and on == (moved >= BACKGROUND_MOTION)
+    given = moved is None and source not in ("known", "pinhole")
+    return Decision(
+        "structure_from_motion", on, moved or 0.0, BACKGROUND_MOTION, "of the picture's longer side a second",
+        why, forced=given or (moved is not None and not as_measured),
+    )  # fmt: skip
+
+
+def face_registration(clip: Clip) -> Decision:
+    """What fit decided about the face."""
+    found, frames = clip.face["registered"], clip.face["frames"]
+    off = clip.face["source"] == "off"
+    why = "switched off by fit.face=off" if off else f"{found} of {frames} frames show a face to register"
+    return Decision("face_registration", found > 0, found, 1.0, "frames with a face", why, forced=off)
+
+
+def part_seen(effect: str, seen: Mapping[str, float]) -> Decision:
+    """Whether a part of the body is ever seen."""
+    share = seen[effect.removeprefix("seen_")]
+    why = f"at most {share:.0%} of it lies in a training frame's picture"
+    return Decision(effect, share >= PART_SEEN, share, PART_SEEN, "of its vertices in one frame", why)
+
+
+def residual(clip: Clip, part: str, seen: bool) -> Decision:
+    """Whether a part shows enough pixels for colours of its own in each frame."""
+    pixels, name = part_pixels(clip, part), part.replace("_", " ")
+    on = seen and pixels >= RESIDUAL_PIXELS
+    if not seen:
+        why = f"the {name} is never seen"
+    elif not pixels:
+        why = f"no detector trusts what it sees of the {name}"
+    else:
+        why = f"the {name} is {pixels:.0f} pixels across"
+    return Decision(f"{part}_residual", on, pixels, RESIDUAL_PIXELS, "pixels across", why)
+
+
+def face_loss(clip: Clip, made: Mapping[str, Decision]) -> Decision:
+    """Whether there is a registered face large enough to be compared."""
+    pixels, registered = part_pixels(clip, "face"), made["face_registration"].on
+    on = registered and made["seen_face"].on and pixels >= RESIDUAL_PIXELS
+    why = f"the registered face is {pixels:.0f} pixels across" if registered else "no face was registered"
+    return Decision("face_loss", on, pixels, RESIDUAL_PIXELS, "pixels across", why)
+
+
+def gate(scores: np.ndarray) -> Decision:
+    """Whether the scores of the fitted body call for the visibility gate."""
+    line = evidence_threshold(scores)
+    cut = line.cut if line.closed else 0.0
+    return Decision("visibility_gate", line.closed, cut, LEAST_CUT, "of the body's vertices", line.why)
+
+
+def azimuths(clip: Clip) -> Decision:
+    """Whether a side of the body is never seen."""
+    joints = rest_joints(clip.body, clip.identity)
+    widest, unseen = unseen_azimuths(clip, joints)
+    on = widest > UNSEEN_RANGE
+    why = (
+        f"{len(unseen)} of 12 sides are never seen, the widest range without a frame has {widest:.0f} degrees"
+    )
+    return Decision("auxiliary_views", on, widest, UNSEEN_RANGE, "degrees never seen", why, values=unseen)
+
+
+def poses_follow(clip: Clip) -> Decision:
+    """Whether the pose changes enough for shape and colour to follow it."""
+    degrees, joint = pose_change(clip)
+    why = (
+        f"the joint that moves most, {joint.replace('_', ' ')}, turns by {degrees:.1f} degrees about its mean"
+    )
+    return Decision("pose_heads", degrees >= POSE_CHANGE, degrees, POSE_CHANGE, "degrees RMS", why)
+
+
+def refinement(clip: Clip) -> Decision:
+    """Whether the fit leaves the training frames' poses anything to gain."""
+    pixels = mean_error(clip, clip.split.train)
+    why = f"the fit's points are {pixels:.2f} pixels off in training frames"
+    return Decision("pose_refinement", pixels >= FIT_PIXELS, pixels, FIT_PIXELS, "pixels", why)
+
+
+def test_time(clip: Clip) -> Decision:
+    """Whether held-out poses are too far off for their scores to say much of the avatar."""
+    pixels = mean_error(clip, clip.split.test)
+    why = (
+        f"the fit's points are {pixels:.2f} pixels off in held-out frames"
+        if clip.split.test
+        else ("no frame is held out")
+    )
+    return Decision("test_time_refinement", pixels >= HELD_OUT_PIXELS, pixels, HELD_OUT_PIXELS, "pixels", why)

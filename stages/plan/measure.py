@@ -1,0 +1,180 @@
+"""The numbers that the plan decides by, each from what ingest and fit published."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import roma
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Architecture, Avatar
+from pipeline.body import JOINT_NAMES, PARTS, BodyModel, Identity, Poses, read_identity, read_poses
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
+from pipeline.person import MARGIN, person_box
+from pipeline.plan import AZIMUTH_STEP
+from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split
+from pipeline.tables import read_table
+from pipeline.visibility import body_in_frame
+
+TRUSTED = 0.4  # score from which a keypoint is believed, as in Eq. 2
+SHOWN = 0.5  # share of a part's points that a frame must show
+LEAST_FRAMES = 0.05  # share of the training frames that must show a part for its size to count
+POINTS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
+MOVING_JOINTS = tuple(range(1, 22)) + (JOINT_NAMES.index("jaw"),)
+
+RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
+"""The columns of fit's residuals.parquet that are read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """What the plan looks at.
+
+    Attributes:
+        footage, split, keypoints: of ingest.
+        cameras: of every frame, cropped to the person's box over the training frames.
+        body, identity, poses: the fitted person.
+        errors: frame number -> mean reprojection error of its trusted keypoints, pixels.
+        face: what fit says of face registration.
+    """
+
+    footage: Footage
+    split: Split
+    keypoints: Keypoints
+    cameras: Mapping[int, Camera]
+    body: BodyModel
+    identity: Identity
+    poses: Poses
+    errors: Mapping[int, float]
+    face: Mapping[str, Any]
+
+
+def read_clip(ingest: Path, fit: Path, body: BodyModel) -> Clip:
+    """Reads it.
+
+    Raises:
+        UserError: a file is missing or damaged, or the files do not go together.
+    """
+    split, cameras = read_split(ingest / "split.json"), read_cameras(ingest / "cameras.parquet")
+    poses = read_poses(fit / "poses.parquet")
+    missing = sorted({*split.train, *split.test} - {*poses.frames} | {*poses.frames} - {*cameras})
+    if missing:
+        raise UserError(
+            f"{fit / 'poses.parquet'}: frame {missing[0]} has no pose or no camera; run fit again"
+        )
+    box = person_box(ingest, split.train, MARGIN)
+    size = (box.right - box.left, box.bottom - box.top)
+    return Clip(
+        footage=read_footage(ingest / "footage.json"),
+        split=split,
+        keypoints=read_keypoints(ingest / "keypoints.parquet"),
+        cameras={frame: camera.cropped(box.left, box.top, *size) for frame, camera in cameras.items()},
+        body=body,
+        identity=read_identity(fit / "identity.safetensors", body),
+        poses=poses,
+        errors=_errors(fit / "residuals.parquet"),
+        face=_face(fit / "face.json"),
+    )
+
+
+def _errors(path: Path) -> dict[int, float]:
+    table = read_table(path, RESIDUALS, "run the fit stage again")
+    frames, pixels = table["frame"], table["pixels"]
+    return {int(frame): float(pixels[frames == frame].mean()) for frame in np.unique(frames)}
+
+
+def _face(path: Path) -> dict[str, Any]:
+    content = read_json(path, "run the fit stage again")
+    if not isinstance(content, dict) or set(content) != {"source", "frames", "registered"}:
+        raise UserError(f"{path} is not what fit says of the face: run the fit stage again")
+    return content
+
+
+def visibility(clip: Clip) -> tuple[np.ndarray, dict[str, float]]:
+    """How often the fitted body's vertices lie in the training frames' pictures.
+
+    Returns:
+        The scores, [V] in [0, 1], and for each part of the body the largest share of its vertices that a
+        training frame shows.
+    """
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    surface = Avatar(clip.body, clip.identity, torch.arange(len(clip.body.v_template)), bare).surfaces[0]
+    labels = surface.canonical.parts
+    size = torch.bincount(labels, minlength=len(PARTS)).clamp_min(1)
+    hits, most = torch.zeros(len(labels)), torch.zeros(len(PARTS))
+    for frame in clip.split.train:
+        row = clip.poses.index(frame)
+        seen = body_in_frame(surface, clip.poses.rotation[row], clip.poses.transl[row], clip.cameras[frame])
+        hits += seen
+        most = torch.maximum(most, torch.bincount(labels[seen], minlength=len(PARTS)) / size)
+    scores = (hits.double() / len(clip.split.train)).numpy()
+    return scores, dict(zip(PARTS, most.tolist(), strict=True))
+
+
+def part_pixels(clip: Clip, part: str) -> float:
+    """The diagonal of a part's box of trusted keypoints, pixels: the median over the frames that show it.
+
+    0 where fewer than ``LEAST_FRAMES`` of the training frames show it.
+    """
+    points = clip.keypoints.whole_body[np.isin(clip.keypoints.frames, clip.split.train)][:, POINTS[part]]
+    trusted = points[..., 2] >= TRUSTED
+    showing = np.flatnonzero(trusted.mean(1) >= SHOWN)
+    if len(showing) < max(1, LEAST_FRAMES * len(points)):
+        return 0.0
+    sizes = [np.linalg.norm(np.ptp(points[row, trusted[row], :2], axis=0)) for row in showing]
+    return float(np.median(sizes))
+
+
+def pose_change(clip: Clip) -> tuple[float, str]:
+    """How far the most moving joint of body and jaw turns about its mean, degrees RMS, and its name."""
+    rows = [clip.poses.index(frame) for frame in clip.split.train]
+    matrices = roma.rotvec_to_rotmat(clip.poses.rotation[rows][:, MOVING_JOINTS].double())
+    mean = roma.special_procrustes(matrices.mean(0))
+    angle = roma.rotmat_geodesic_distance(matrices, mean.expand_as(matrices))
+    spread = torch.rad2deg(angle.square().mean(0).sqrt())
+    most = int(spread.argmax())
+    return float(spread[most]), JOINT_NAMES[MOVING_JOINTS[most]]
+
+
+def unseen_azimuths(clip: Clip, joints: Tensor) -> tuple[float, tuple[float, ...]]:
+    """The sides of the body that no training frame shows.
+
+    Args:
+        clip: the clip.
+        joints: [55, 3], rest joints; the first is the pelvis.
+
+    Returns:
+        The widest unbroken range of bins without a frame, degrees, and all such bins' centres.
+    """
+    seen = [False] * (360 // AZIMUTH_STEP)
+    for frame in clip.split.train:
+        row = clip.poses.index(frame)
+        turn = roma.rotvec_to_rotmat(clip.poses.rotation[row, 0])
+        towards = turn.T @ (clip.cameras[frame].centre - clip.poses.transl[row] - joints[0])
+        azimuth = float(torch.rad2deg(torch.atan2(towards[0], towards[2])))
+        seen[round(azimuth / AZIMUTH_STEP) % len(seen)] = True
+    unseen = tuple(float(AZIMUTH_STEP * place) for place, one in enumerate(seen) if not one)
+    return float(AZIMUTH_STEP * _longest(seen)), unseen
+
+
+def _longest(seen: Sequence[bool]) -> int:
+    """The longest run of False in a ring."""
+    longest = run = 0
+    for one in (*seen, *seen):
+        run = 0 if one else run + 1
+        longest = max(longest, run)
+    return min(longest, len(seen))
+
+
+def mean_error(clip: Clip, frames: Sequence[int]) -> float:
+    """Mean reprojection error of some frames, pixels; 0 where none has a trusted keypoint."""
+    errors = [clip.errors[frame] for frame in frames if frame in clip.errors]
+    return float(np.mean(errors)) if errors else 0.0

@@ -1,0 +1,181 @@
+"""The visibility gate: what is seen too seldom takes no part in training (paper, Section 3.4).
+
+Each drawn frame says of each body vertex whether it shows it, by one of two definitions:
+
+- ``in_frame``: the vertex lies in the crop around the person and in front of the camera. It is measured
+  for gated vertices as for all others, by posing the bare body, which costs a millisecond.
+- ``contributes``: its Gaussian has blending weight in the rendering. Gated ones are in no rendering; the
+  bare body is rendered in every ``PROBE``-th drawn frame for them alone.
+
+The score v_i is the share of the frames looked at (Eq. 7), over captured and generated frames apart, from
+the first iteration on and never forgotten. After the warm-up, and regularly again, a line is drawn through
+the captured frames' scores (:mod:`pipeline.visibility`) and what lies below it is gated: it leaves
+``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
+that a region that comes into view later returns.
+
+The counters and the avatar's own mark of what is active are buffers; a checkpoint holds them, and a
+resumed run goes on exactly as one that was never stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import torch
+from torch import Tensor, nn
+
+from pipeline.avatar import Avatar, Surface
+from pipeline.avatar.canonical import dilate
+from pipeline.records import write_json
+from pipeline.splat import render
+from pipeline.tables import write_table
+from pipeline.visibility import Line, authors_threshold, body_in_frame, evidence_threshold, fixed_threshold
+from stages.train.data import View
+from stages.train.poses import FramePose
+from stages.train.settings import TrainSettings
+
+SCHEMA = pa.schema(
+    [
+        ("vertex", pa.int32()),
+        ("captured", pa.float32()),
+        ("generated", pa.float32()),
+        ("early", pa.bool_()),
+        ("kept", pa.bool_()),
+    ]
+)
+PROBE = 8  # drawn frames for one in which gated vertices are looked for, where that needs a rendering
+CAPTURED, GENERATED = 0, 1
+
+
+class Gate(nn.Module):
+    """The scores of one run, and the line through them.
+
+    Attributes:
+        hits, looked: [2, K] int64, how many drawn frames showed each of the avatar's body vertices, and how
+            many were looked at; captured and generated frames.
+        line: the last line that was drawn; None before the warm-up has ended.
+    """
+
+    hits: Tensor
+    looked: Tensor
+
+    def __init__(self, avatar: Avatar, vertices: int, settings: TrainSettings):
+        """Counts nothing yet.
+
+        Args:
+            avatar: whose body vertices are counted.
+            vertices: of the whole body; those that the avatar has not are never seen.
+            settings: of the stage.
+        """
+        super().__init__()
+        self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
+        for name in ("hits", "looked"):
+            self.register_buffer(name, torch.zeros(2, len(avatar.kept), dtype=torch.long))
+        self.line: Line | None = None
+        self._first = avatar.active.clone()  # what is trained while the gate stays open
+
+    @property
+    def avatar(self) -> Avatar:
+        """Kept in a tuple, so that its weights are not taken for this module's."""
+        return self._avatar[0]
+
+    @torch.no_grad()
+    def watch(self, surface: Surface, position: int, pose: FramePose, view: View, weights: Tensor) -> None:
+        """Counts what one drawn frame shows.
+
+        Args:
+            surface: what was rendered.
+            position: which draw of the run it was.
+            pose: in which it was rendered.
+            view: the frame.
+            weights: [N], the Gaussians' blending weights.
+        """
+        source = GENERATED if view.generated else CAPTURED
+        if self._settings.gate_definition == "in_frame":
+            self.hits[source] += body_in_frame(
+                self.avatar.surfaces[0], pose.rotation, pose.transl, view.camera
+            )
+            self.looked[source] += 1
+            return
+        count = len(self.avatar.kept)
+        rows = torch.arange(count) if surface.rows is None else surface.rows
+        drawn = rows < count  # the Gaussians at the body's own vertices, on whichever level
+        self.hits[source, rows[drawn]] += weights[: len(rows)][drawn] > 0
+        self.looked[source, rows[drawn]] += 1
+        if position % PROBE == 0 and not bool(self.avatar.active.all()):
+            bare = self.avatar.bare(self.avatar.surfaces[0], pose.rotation, pose.expression, pose.transl)
+            gated = ~self.avatar.active
+            self.hits[source] += gated & (render(bare, view.camera).weights > 0)
+            self.looked[source] += gated
+
+    def scores(self) -> Tensor:
+        """v_i of the avatar's body vertices, captured and generated: [2, K] in [0, 1]."""
+        return self.hits / self.looked.clamp_min(1)
+
+    def whole_body(self, values: Tensor) -> np.ndarray:
+        """What is known of the avatar's vertices, [K], over the whole body, [V] float64; else 0."""
+        whole = torch.zeros(self._vertices, dtype=torch.float64)
+        whole[self.avatar.kept] = values.double()
+        return whole.numpy()
+
+    def due(self, iteration: int) -> bool:
+        """Whether a line is drawn after that many iterations."""
+        settings = self._settings
+        first = round(settings.gate_from * settings.iterations)
+        return iteration >= max(1, first) and (iteration - first) % settings.gate_every == 0
+
+    def update(self) -> Line:
+        """Draws the line and gates what lies below it."""
+        captured, generated = self.scores()
+        self.line = self._line(self.whole_body(captured))
+        active = captured >= self.line.tau
+        if self._settings.unseen == "generated":
+            active |= (generated >= self.line.tau) & (self.looked[GENERATED] > 0)
+        faces, rings = self.avatar.surfaces[0].canonical.faces, self._settings.gate_rings
+        self.avatar.gate(dilate(active, faces, rings) if self.line.closed else self._first)
+        return self.line
+
+    def _line(self, scores: np.ndarray) -> Line:
+        settings = self._settings
+        if settings.gate_threshold is not None:
+            return fixed_threshold(scores, settings.gate_threshold)
+        return authors_threshold(scores) if settings.gate_guard == "authors" else evidence_threshold(scores)
+
+    def write(self, folder: Path) -> None:
+        """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the line."""
+        captured, generated = self.scores()
+        write_visibility(
+            folder / "visibility.parquet",
+            captured=self.whole_body(captured),
+            generated=self.whole_body(generated),
+            early=self.whole_body(self._first) == 0,
+            kept=self.whole_body(self.avatar.active) == 1,
+        )
+        line = self.line or self._line(self.whole_body(captured))
+        content = dataclasses.asdict(line) | {
+            "definition": self._settings.gate_definition,
+            "drawn": {"captured": int(self.looked[CAPTURED].max()), "generated": int(self.looked[1].max())},
+        }
+        write_json(folder / "gate.json", content)
+
+
+def write_ungated(folder: Path, vertices: int) -> None:
+    """What ``Gate.write`` writes, for a run in which nothing was counted and nothing gated."""
+    nothing, everything = np.zeros(vertices), np.ones(vertices, bool)
+    columns = {"captured": nothing, "generated": nothing, "early": ~everything, "kept": everything}
+    write_visibility(folder / "visibility.parquet", **columns)
+    content = dataclasses.asdict(Line(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "the gate was off"))
+    write_json(folder / "gate.json", content | {"definition": None, "drawn": {"captured": 0, "generated": 0}})
+
+
+def write_visibility(path: Path, **columns: np.ndarray) -> None:
+    """Writes ``visibility.parquet``: the columns of ``SCHEMA`` but the first, [V] each.
+
+    ``captured`` and ``generated`` are the scores, ``early`` marks what got no Gaussian to begin with, and
+    ``kept`` what the finished avatar has.
+    """
+    vertex = np.arange(len(columns["captured"]))
+    write_table(path, SCHEMA, {"vertex": vertex, **columns})

@@ -1,0 +1,30 @@
+"""The settings of a run once the plan has been heard: what it does not name is not built."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pipeline.plan import Plan
+from stages.train.settings import TrainSettings
+
+RESIDUALS = ("face", "left_hand", "right_hand")
+
+
+def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
+    """Switches off what the plan calls needless; it never switches on what settings left out.
+
+    Args:
+        settings: as set.
+        plan: of the subject.
+    """
+    needless = {part for part in RESIDUALS if not plan.on(f"{part}_residual")}
+    parts = tuple(part for part in settings.residual_parts if part not in needless)
+    return dataclasses.replace(
+        settings,
+        residual_parts=parts,
+        residual_from=settings.residual_from if parts else 1.0,
+        pose_heads_from=settings.pose_heads_from if plan.on("pose_heads") else 1.0,
+        refine_poses=settings.refine_poses and plan.on("pose_refinement"),
+        face=settings.face if plan.on("face_loss") else 0.0,
+        gate=settings.gate and plan.on("visibility_gate"),
+    )
