@@ -22,9 +22,6 @@ import numpy as np
 from pipeline.errors import UserError
 
 ASSETS = ("dlib", "identity")
-SAME_PERSON = 0.6
-"""The distance that dlib's authors take for the border between one person and two."""
-
 _RESNET = "dlib_face_recognition_resnet_model_v1.dat"
 _POINTS = "shape_predictor_5_face_landmarks.dat"
 _SMALLEST = 80  # pixels; the finder knows no smaller face, so pictures are enlarged until it does
@@ -92,7 +89,7 @@ class FaceReader:
 
 
 def identity_distance(first: np.ndarray, second: np.ndarray) -> float:
-    """The Euclidean distance of two embeddings; 0 is the same picture, above 0.6 another person."""
+    """The Euclidean distance of two embeddings; beyond 0.6 it is probably another person."""
     return float(np.linalg.norm(np.asarray(first) - np.asarray(second)))
 
 

@@ -100,7 +100,11 @@ def accept_checked(context: Context, clip: Clip, landmarks: Landmarks, offer: Of
             reasons[row] = check.MASK
     kept = [row for row in left if reasons[row] is None]
     frames = [looks[row].frame for row in kept]
-    notes = () if subject is not None else ("no face is found in the clip: identity was not checked",)
+    notes = (
+        ()
+        if subject is not None
+        else ("no face in the clip is large enough to be known again: identity was not checked",)
+    )
     return Accepted(
         folder=folder,
         poses=rows_of(poses, frames),
@@ -130,9 +134,9 @@ def _driving(clip: Clip, landmarks: Landmarks, offer: Offer, looks: list[Look]) 
         row, camera = offer.poses.index(look.frame), offer.cameras[look.frame]
         vertices, joints = posed(clip, offer.poses, row)
         driven = driven_keypoints(clip, landmarks, joints, vertices, camera)
-        matched.append(check.match(look.keypoints, driven))
         place = check.mean_place(vertices)
         cosines.append(check.head_facing(clip, offer.poses.rotation[row], camera, place))
+        matched.append(check.match(look.keypoints, driven, cosines[-1]))
     return _Driving(matched, cosines)
 
 

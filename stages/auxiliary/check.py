@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,9 +30,11 @@ MASK = "mask off the body"
 FACE_OF = "face of another person"
 FLICKER = "flicker"
 
-FRONTAL, BACKWARD = 0.8, -0.5  # cosines between the head's front and the view
+FRONTAL = 0.8  # cosine between the head's front and the view from which faces are compared
+TOWARDS, BACKWARD = 0.6, -0.5  # cosines beyond which a face has to be seen, or must not be
 FACE_SCORE = 0.5  # mean score from which a face counts as seen
-SMALL_PART = 0.01  # of the body's pixels; a part that shows less is not asked for
+TOLERANCE = 0.008  # of the body's height, by which a registration may be off
+SMALL_PART = 0.015  # of the body's pixels; a part that shows less is not asked for
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg", "head", "face", "torso")
 
 
@@ -49,15 +52,21 @@ class Matched:
     mirrored: bool
 
 
-def match(found: np.ndarray, driven: np.ndarray) -> Matched:
-    """Compare [133, 3] keypoints with the driving pose's [133, 3]."""
+def match(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> Matched:
+    """Compare [133, 3] keypoints with the driving pose's [133, 3].
+
+    Args:
+        found: what was detected.
+        driven: what was asked for.
+        cosine: between the head's front and the view; sides may be exchanged in backs only.
+    """
     body, there = found[BODY], driven[BODY]
     inside = driven[BODY, 2] > 0
     if inside.sum() < 4:
         return Matched(np.inf, False)
     height = max(1.0, float(np.ptp(there[inside, 1])), float(np.ptp(there[inside, 0])))
     straight = _distance(body, there)
-    exchanged = _distance(body[MIRRORED[:17]], there)
+    exchanged = _distance(body[MIRRORED[:17]], there) if cosine < 0 else np.inf
     return Matched(min(straight, exchanged) / height, exchanged < 0.7 * straight)
 
 
@@ -91,7 +100,7 @@ def head_facing(clip: Clip, rotation: Tensor, camera: Camera, place: Tensor) -> 
 def wrong_way(look: Look, cosine: float) -> bool:
     """Whether a face is seen where there should be a back of a head, or none where there should be one."""
     seen = float(look.keypoints[FACE, 2].mean()) >= FACE_SCORE
-    return (cosine > FRONTAL and not seen) or (cosine < BACKWARD and seen and look.embedding is not None)
+    return (cosine > TOWARDS and not seen) or (cosine < BACKWARD and seen)
 
 
 def mask_fits(
@@ -105,6 +114,9 @@ def mask_fits(
         return False
     if int((person & ~body).sum()) > settings.mask_outside * area:
         return False
+    rows = np.flatnonzero(body.any(1))
+    reach = 2 * max(1, round(TOLERANCE * (rows[-1] - rows[0] + 1))) + 1
+    person = cv2.dilate(person.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     labels = part_labels(clip.body).numpy()[clip.body.faces[:, 0].numpy()]
     parts = np.where(body, labels[np.maximum(raster.face, 0)], -1)
     for name in LIMBS:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LONGEST = 1280  # pixels of the longer side that the estimator is shown
 THUMB = 64  # pixels, of the small copy's longer side
 FACES = 9  # frames of the clip whose faces say who it is
+SMALLEST_FACE = 40  # pixels of a face's longer side under which its embedding says nothing
 FACE_ROOM = 0.8  # of the face's size, around it, for the face finder
 _SURE = 1e-3  # segmentations are kept this far from 0 and 1 before logarithms are taken
 
@@ -83,13 +84,15 @@ class Watcher:
         if len(face) < 10:
             return None
         low, high = face.min(0), face.max(0)
+        if float((high - low).max()) < SMALLEST_FACE:
+            return None
         room = FACE_ROOM * float((high - low).max())
         box = tuple(int(value) for value in (*(low - room), *(high + room)))
         found = self._faces.read(image, box)  # type: ignore[arg-type]
         return found.embedding if found else None
 
     def subject(self, clip: Clip) -> np.ndarray | None:
-        """The clip's own face; None where the finder sees none in it."""
+        """The clip's own face; None where the finder sees none in it that is large enough."""
         scored = [(clip.keypoints.whole_body[clip.keypoints.index(f), FACE, 2].mean(), f) for f in clip.train]
         best = [frame for score, frame in sorted(scored, key=lambda one: (-one[0], one[1])) if score > 0.3]
         best = best[:: max(1, len(best) // (4 * FACES))][:FACES]

@@ -46,7 +46,9 @@ class AuxiliarySettings:
     keypoint_distance: float = 0.06  # mean distance of trusted body points from the driving pose's
     mask_missing: float = 0.4  # share of a limb that the mask may lack
     mask_outside: float = 0.5  # of the body's area, how much mask may lie beside the body
-    identity_distance: float = 0.6  # of a face from the subject's own
+    identity_distance: float = (
+        0.55  # of a face from the subject's own; one person's differ by 0.5, two people's by 0.66
+    )
     flicker: float = 3.0  # times the usual change from frame to frame
     check: bool = True  # whether frames of mimicmotion and folder are checked at all
     register: bool = True  # fit the poses of the kept frames, starting from the driving pose
