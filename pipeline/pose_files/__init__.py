@@ -7,6 +7,8 @@ a frame, under the same names: ``root_pose`` [3], ``body_pose`` [21][3], ``jaw_p
 ingest stage makes of them is an ``InitialPoses`` too, which ``record`` hands on to the fit stage.
 """
 
+from pipeline.pose_files.axes import into_camera, into_world, moved_pivot
+from pipeline.pose_files.export import tool_joints, write_peer_files
 from pipeline.pose_files.hands import with_flat_hands
 from pipeline.pose_files.read import (
     InitialPoses,
@@ -18,6 +20,7 @@ from pipeline.pose_files.read import (
 from pipeline.pose_files.record import RECORD, read_record, write_record
 
 __all__ = [
-    "RECORD", "InitialPoses", "on_frames", "read_hand_mean", "read_initial_poses", "read_known_poses",
-    "read_record", "with_flat_hands", "write_record",
+    "RECORD", "InitialPoses", "into_camera", "into_world", "moved_pivot", "on_frames", "read_hand_mean",
+    "read_initial_poses", "read_known_poses", "read_record", "tool_joints", "with_flat_hands",
+    "write_peer_files", "write_record",
 ]  # fmt: skip

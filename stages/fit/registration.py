@@ -24,7 +24,7 @@ from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
 from stages.fit.optimise import Watch, optimise
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
-from stages.fit.pose_files import initial_facing, initial_from_files
+from stages.fit.pose_start import initial_facing, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.solver import STEPS, solve

@@ -24,12 +24,12 @@ from pipeline.body import (
 from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
-from pipeline.pose_files import read_hand_mean
+from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.records import read_cameras, read_footage, write_json
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
-from stages.fit.pose_files import given_poses, keep_given, write_peer_files
+from stages.fit.pose_given import given_poses, keep_given
 from stages.fit.registration import Registration, register, steps_of, views_of
 from stages.fit.residuals import group_means, write_residuals
 from stages.fit.smoothing import smooth

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from pipeline.detection.estimator import Estimate, Estimator, estimator_scale, resize
+from pipeline.detection.wholebody import Landmarks, inside, to_keypoints, to_pixels
 from pipeline.frames import write_frame, write_mask
 from pipeline.keypoints import BODY, Keypoints, empty_keypoints
 from stages.ingest import people
 from stages.ingest.detections import check_frames, read_foreign_mask, read_whole_body
-from stages.ingest.estimator import Estimate, Estimator, Finder, estimator_scale, resize
+from stages.ingest.finder import Finder
 from stages.ingest.masks import write_raw
 from stages.ingest.settings import IngestSettings
 from stages.ingest.sources import Sources
 from stages.ingest.video import Clip, Picture, read_clip
-from stages.ingest.wholebody import Landmarks, inside, to_keypoints, to_pixels
 
 if TYPE_CHECKING:
     from pipeline.stage import Context

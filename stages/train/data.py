@@ -29,12 +29,14 @@ class View:
         alpha: [H, W] in [0, 1], the person's soft mask.
         camera: of the crop.
         generated: whether a model made the picture; its losses then weigh less.
+        trust: [H, W] in [0, 1], how far each pixel is to be learnt from; None where all of them are.
     """
 
     color: Tensor  # [H, W, 3]
     alpha: Tensor  # [H, W]
     camera: Camera
     generated: bool = False
+    trust: Tensor | None = None  # [H, W]
 
     def composite(self, background: Tensor, alpha: Tensor | None = None) -> Tensor:
         """The person over a plain background, [3] -> [H, W, 3].

@@ -159,7 +159,7 @@ class Objective:
         terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
         if settings.face and not view.generated:
             terms["face"] = settings.face * self._face_term(decoded, posed, view)
-        if settings.pose_change and poses_move:
+        if settings.pose_change and poses_move and not view.generated:
             terms["pose_change"] = settings.pose_change * self.poses.change(draw.frame)
         return terms
 
@@ -177,6 +177,8 @@ class Objective:
         target = self._target(rendering, view, draw)
         if settings.mask_band and not settings.mask_refine:
             image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
+        if view.trust is not None:
+            image = losses.believed(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
         terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}

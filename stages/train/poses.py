@@ -69,12 +69,13 @@ class PoseRefinement(nn.Module):
         parts = [self.rotation[name].flatten(), self.expression[name], 10 * self.transl[name]]
         return torch.cat(parts).square().mean()
 
-    def refined(self) -> Poses:
-        """All frames' poses as they now are."""
+    def refined(self, frames: tuple[int, ...] | None = None) -> Poses:
+        """Poses as they now are, of all frames or of some."""
+        frames = self.poses.frames if frames is None else frames
         with torch.no_grad():
-            each = [self(frame) for frame in self.poses.frames]
+            each = [self(frame) for frame in frames]
         return Poses(
-            frames=self.poses.frames,
+            frames=frames,
             rotation=torch.stack([pose.rotation for pose in each]),
             expression=torch.stack([pose.expression for pose in each]),
             transl=torch.stack([pose.transl for pose in each]),

@@ -25,6 +25,7 @@ from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.costs import saved
 from stages.train.data import Frames, scenery_of, spread
 from stages.train.gate import Gate, write_ungated
+from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
 from stages.train.obey import obey
 from stages.train.objective import Evidence
@@ -44,6 +45,7 @@ class Inputs:
         crops: training frames around the person.
         whole: uncropped frames.
         times: seconds of frames from the clip's start, of all that have a time.
+        generated: frames that a model made of sides the camera never saw, if there are any.
     """
 
     body: BodyModel
@@ -53,11 +55,23 @@ class Inputs:
     crops: Frames
     whole: Frames
     times: Mapping[int, float]
+    generated: Generated | None = None
+
+    @property
+    def views(self) -> Frames:
+        """Every frame that is learnt from, captured and generated."""
+        return BothFrames(self.crops, self.generated.views) if self.generated else self.crops
+
+    @property
+    def all_poses(self) -> Poses:
+        """The poses of captured and generated frames."""
+        return joined(self.poses, self.generated.poses) if self.generated else self.poses
 
     def evidence(self, texture: Tensor | None, settings: TrainSettings) -> Evidence:
         """The training frames, and the mean colours that they show, [N, 3]."""
+        made = self.generated.frames if self.generated else ()
         scenery = scenery_of(self.crops, self.split.train) if settings.scenery else None
-        return Evidence(self.crops, self.split.train, self.times, texture, scenery)
+        return Evidence(self.views, (*self.split.train, *made), self.times, texture, scenery)
 
 
 def run(context: Context) -> None:
@@ -79,7 +93,7 @@ def train_subject(context: Context) -> None:
     """Reads the inputs, trains what the plan calls for, and writes what is published."""
     inputs = read_inputs(context)
     settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
-    refinement = PoseRefinement(inputs.poses, inputs.split.train)
+    refinement = PoseRefinement(inputs.all_poses, inputs.split.train)
     started = time.monotonic()
     avatar, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
@@ -88,18 +102,18 @@ def train_subject(context: Context) -> None:
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()
-    publish(trainer, inputs.body, context)
+    publish(trainer, inputs, context)
     context.timing("saved", saved(avatar, len(inputs.body.v_template), context.settings, settings))
 
 
-def publish(trainer: Trainer, body: BodyModel, context: Context) -> None:
+def publish(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     """Writes the finished avatar and what is known of its making."""
-    avatar, output = trainer.avatar, context.output
+    avatar, output, body = trainer.avatar, context.output, inputs.body
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
         fill_unseen(avatar)
     save_avatar(output / "avatar.safetensors", avatar)
-    write_poses(output / "poses.parquet", trainer.poses.refined())
+    write_poses(output / "poses.parquet", trainer.poses.refined(inputs.poses.frames))
     trainer.curve.write(output / "curve.parquet")
     if trainer.gate is None:
         write_ungated(output, len(body.v_template))
@@ -127,6 +141,7 @@ def read_inputs(context: Context) -> Inputs:
         crops=Frames(ingest, cameras, box),
         whole=Frames(ingest, cameras),
         times=dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False)),
+        generated=read_generated(context.inputs.get("auxiliary"), poses),
     )
 
 
@@ -148,7 +163,8 @@ def prepare(
     texture = None
     if settings.initial_color or settings.face:
         chosen = spread(inputs.split.train, settings.color_frames)
-        logits = first_colors(avatar.eval(), refinement, inputs.crops, chosen, settings.mask_band)
+        made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
+        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)
@@ -196,7 +212,8 @@ def architecture(settings: TrainSettings) -> Architecture:
 def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     """Runs the iterations that are left, with checkpoints and points of the curve."""
     settings = trainer.settings
-    key = run_key(as_dict(settings), [inputs.poses.rotation, inputs.poses.transl, trainer.avatar.kept])
+    poses = inputs.all_poses
+    key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
     started, first = time.monotonic(), trainer.iteration

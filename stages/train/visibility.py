@@ -63,7 +63,12 @@ def fill_unseen(avatar: Avatar) -> None:
 
 
 def first_colors(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int = 0
+    avatar: Avatar,
+    poses: PoseRefinement,
+    views: Frames,
+    chosen: tuple[int, ...],
+    band: int = 0,
+    made: tuple[int, ...] = (),
 ) -> Tensor:
     """Logits of the mean colour that the chosen frames show at each Gaussian, [N, 3].
 
@@ -78,6 +83,24 @@ def first_colors(
         chosen: frame numbers.
         band: pixels on either side of the silhouette where the mask is in doubt. What is seen there
             alone takes its neighbours' colour, not that of the background which the mask may hold.
+        made: generated frames; they are asked for what no chosen frame shows.
+    """
+    total, weight = _shown(avatar, poses, views, chosen, band)
+    if made:
+        total_made, weight_made = _shown(avatar, poses, views, made, band)
+        unseen = weight == 0
+        total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
+    neighbours = avatar.surfaces[-1].neighbours
+    return torch.logit(fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+
+
+def _shown(
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int
+) -> tuple[Tensor, Tensor]:
+    """Colours that some frames show at each Gaussian, summed by blending weight, and the weights.
+
+    Returns:
+        [N, 3] and [N, 1].
     """
     total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar), 1)
     for frame in chosen:
@@ -91,8 +114,7 @@ def first_colors(
         person = (believed & (view.alpha > 0.5)).float()[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
-    neighbours = avatar.surfaces[-1].neighbours
-    return torch.logit(fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+    return total, weight
 
 
 def fill(total: Tensor, weight: Tensor, neighbours: SparsePair) -> Tensor:

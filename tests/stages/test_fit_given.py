@@ -149,7 +149,7 @@ def test_records_come_back_and_damaged_ones_are_named(tmp_path, ingested):
 
 def test_mean_identity_stands_for_a_missing_shape(shown, ingested):
     record = with_flat_hands(read_record(ingested / RECORD), BODY_FILE, False)
-    from stages.fit.pose_files.given import _identity
+    from stages.fit.pose_given import _identity
 
     bare = dataclasses.replace(record, betas=None, joint_offset=None, face_offset=None)
     found, mean = _identity(bare, shown.body, "nothing"), mean_identity(shown.body)

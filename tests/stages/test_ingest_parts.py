@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.background import learn
+from pipeline.detection.estimator import estimator_scale
+from pipeline.detection.wholebody import Landmarks, detour, score_faces, score_hands, to_keypoints
 from pipeline.errors import UserError
 from pipeline.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
 from stages.ingest import people
 from stages.ingest.background import take_out
 from stages.ingest.edges import follow_edges
-from stages.ingest.estimator import estimator_scale
 from stages.ingest.masks import (
     fill_holes,
     fuse,
@@ -27,7 +28,6 @@ from stages.ingest.people import Person
 from stages.ingest.settings import IngestSettings
 from stages.ingest.split import split_frames
 from stages.ingest.steady import steady
-from stages.ingest.wholebody import Landmarks, detour, score_faces, score_hands, to_keypoints
 from tests.stages.ingest_clips import walking_blob
 
 # People.

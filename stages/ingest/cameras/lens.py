@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pycolmap
 
+from pipeline.detection.wholebody import inside
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.keypoints import Keypoints
 from stages.ingest.cameras.calibration import View, pinhole_lens
 from stages.ingest.video import Clip
-from stages.ingest.wholebody import inside
 
 SAME_SHAPE = 0.02  # by how much the calibrated picture's proportions may differ from the clip's
 LEFT_ALONE = 1.0  # pixels of the stored frame; resampling would cost more than a smaller distortion

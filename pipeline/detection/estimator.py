@@ -1,4 +1,4 @@
-"""MediaPipe 0.10.21: one person's landmarks and soft segmentations, and a finder of people.
+"""MediaPipe 0.10.21: one person's landmarks and soft segmentations.
 
 The package is an asset, not a dependency: its folder is put on the path when an estimator is made.
 """
@@ -18,15 +18,9 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
-from stages.ingest.people import Person
 
-_FINDER_GRAPH = """
-input_stream: "image"
-output_stream: "detections"
-node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
-"""
 BOX_LEVEL, BOX_MARGIN = 0.3, 0.12  # the person's box: where the pose mask exceeds this, and this much around
-_BLANK = np.zeros((64, 64, 3), np.uint8)
+BLANK = np.zeros((64, 64, 3), np.uint8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,30 +48,32 @@ class Estimate:
 
 
 class Estimator:
-    """Follows one person through a clip; pictures must come in order."""
+    """Follows one person through a clip; pictures must come in order, unless each stands for itself."""
 
-    def __init__(self, asset: Path, native_log: Path) -> None:
+    def __init__(self, asset: Path, native_log: Path, still: bool = False) -> None:
         """Load the models from the asset's folder; UserError if they cannot be loaded.
 
         Args:
             asset: the folder that holds ``mediapipe/``.
             native_log: where the models' native code may write its remarks.
+            still: look at every picture as if it were the first.
         """
-        solutions = _load(asset)
+        solutions = load(asset)
         self._native_log = native_log
-        with _aside(native_log):
+        with aside(native_log):
             self._holistic = solutions.holistic.Holistic(
+                static_image_mode=still,
                 model_complexity=1,
                 enable_segmentation=True,
                 smooth_segmentation=False,  # masks are made steady later, along the motion
                 refine_face_landmarks=True,
             )
             self._selfie = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
-            self._holistic.process(_BLANK), self._selfie.process(_BLANK)  # the models finish loading here
+            self._holistic.process(BLANK), self._selfie.process(BLANK)  # the models finish loading here
 
     def estimate(self, image: np.ndarray) -> Estimate | None:
         """The person in ``image`` [H, W, 3] uint8 RGB, or None where there is none."""
-        with _aside(self._native_log):
+        with aside(self._native_log):
             found = self._holistic.process(image)
         if found.pose_landmarks is None or found.segmentation_mask is None:
             return None
@@ -100,39 +96,9 @@ class Estimator:
             margin = round(BOX_MARGIN * (places[-1] + 1 - places[0]))
             box.append(slice(max(0, places[0] - margin), min(length, places[-1] + 1 + margin)))
         part = np.ascontiguousarray(image[box[0], box[1]])
-        with _aside(self._native_log):
+        with aside(self._native_log):
             whole[box[0], box[1]] = np.clip(self._selfie.process(part).segmentation_mask, 0, 1)
         return whole
-
-
-class Finder:
-    """Finds every person in a picture, without following anyone."""
-
-    def __init__(self, asset: Path, native_log: Path) -> None:
-        """Load the person detector; arguments and errors as those of :class:`Estimator`."""
-        _load(asset)
-        self._native_log = native_log
-        from google.protobuf import text_format
-
-        base = importlib.import_module("mediapipe.python.solution_base")
-        messages = importlib.import_module("mediapipe.framework.calculator_pb2")
-        graph = text_format.Parse(_FINDER_GRAPH, messages.CalculatorGraphConfig())
-        with _aside(native_log):
-            self._graph = base.SolutionBase(graph_config=graph, outputs=["detections"])
-            self._graph.process(_BLANK)
-
-    def find(self, image: np.ndarray) -> list[Person]:
-        """The people in ``image`` [H, W, 3] uint8 RGB; coordinates in its pixels."""
-        height, width = image.shape[:2]
-        with _aside(self._native_log):
-            found = self._graph.process(image).detections or []
-        people = []
-        for detection in found:
-            points = [(p.x * width, p.y * height) for p in detection.location_data.relative_keypoints]
-            hips, rim, shoulders = (np.array(point) for point in points[:3])
-            radius = float(np.linalg.norm(rim - hips))
-            people.append(Person(hips, shoulders, radius, float(detection.score[0])))
-        return people
 
 
 def estimator_scale(width: int, height: int, short_side: int, long_side: int) -> float:
@@ -151,7 +117,7 @@ def resize(image: np.ndarray, scale: float) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
 
 
-def _load(asset: Path) -> Any:
+def load(asset: Path) -> Any:
     """``mediapipe.solutions`` from the asset's folder."""
     os.environ.setdefault("GLOG_minloglevel", "3")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -167,7 +133,7 @@ def _load(asset: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _aside(log: Path) -> Iterator[None]:
+def aside(log: Path) -> Iterator[None]:
     """What native code prints to the terminal's error stream goes to ``log`` instead."""
     sys.stderr.flush()
     kept, target = os.dup(2), os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)

@@ -1,0 +1,251 @@
+"""What auxiliary views are worth: ``python -m benchmarks.auxiliary [--quick] [--json FILE] [--sheet FILE]``.
+
+A mannequin with a textured back is filmed from the front. Its avatar is trained without auxiliary views,
+with the ``texture`` generator's at weights 0.1 and 1, and with the truth's own pictures of all sides at 0.1
+and 1 (the ceiling), and compared with the truth on the seen side (the pipeline's camera) and on the side that
+no camera saw (135, 180 and 225 degrees), in held-out frames. The fit is the pipeline's own and the same for
+all. PSNR, SSIM and LPIPS are of the person on black in the box around it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import roma
+import torch
+
+from benchmarks import machine
+from pipeline.artifact import Artifact
+from pipeline.avatar import Avatar, load_avatar
+from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
+from pipeline.camera import Camera
+from pipeline.errors import UserError
+from pipeline.frames import write_frame, write_mask, write_png
+from pipeline.job import Job, job_from_words, run_stage
+from pipeline.metrics import Lpips, composite, psnr, ssim
+from pipeline.records import read_split, write_cameras
+from pipeline.splat import render
+from stages.ingest.mannequin.footage import Filming
+from stages.ingest.mannequin.scene import Picture, Scene, film, make_background
+from stages.ingest.mannequin.spec import spec_of
+
+UNSEEN = (135.0, 180.0, 225.0)  # degrees
+MOTION = {"full": "sway+gesture", "upper": "sway+gesture", "head": "nod+speech"}
+MARGIN = 8  # pixels around the person's box
+CONTESTANTS: dict[str, dict[str, str]] = {
+    "none": {"auxiliary.generator": "off"},
+    "texture 0.1": {"auxiliary.generator": "texture"},
+    "texture 1.0": {"auxiliary.generator": "texture", "train.generated": "1.0"},
+    "truth 0.1": {"auxiliary.generator": "folder"},
+    "truth 1.0": {"auxiliary.generator": "folder", "train.generated": "1.0"},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One contestant on one side of one mannequin; means over frames and cameras."""
+
+    framing: str
+    contestant: str
+    side: str
+    psnr: float
+    ssim: float
+    lpips: float
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the stages, compare, print; returns the exit status."""
+    options = _options(arguments)
+    machine.prepare("benchmarks.auxiliary", 1)
+    rows, sheet = [], []
+    with contextlib.ExitStack() as stack:
+        folder = options.artifacts or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for framing in options.framings.split(","):
+            try:
+                for row, pictures in _compared(framing, folder, options):
+                    rows.append(row)
+                    sheet.extend(pictures)
+            except UserError as error:
+                print(f"auxiliary: {error}", file=sys.stderr)
+                return 1
+    _print(rows)
+    if options.json is not None:
+        options.json.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")
+    if options.sheet is not None and sheet:
+        write_png(options.sheet, np.concatenate(sheet))
+    print(_headline(rows))
+    return 0
+
+
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.auxiliary", description="Auxiliary views on mannequins."
+    )
+    parser.add_argument("--quick", action="store_true", help="16 frames, 100 iterations")
+    parser.add_argument("--framings", default="full", help="full, upper, head, joined by commas")
+    parser.add_argument("--contestants", default=",".join(CONTESTANTS), help="names joined by commas")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every row there")
+    parser.add_argument("--sheet", type=Path, metavar="FILE", help="write pictures there")
+    parser.add_argument("--artifacts", type=Path, metavar="DIR", help="keep the stages' results there")
+    parser.add_argument(
+        "words", nargs="*", metavar="NAME=VALUE", help="settings, such as train.iterations=200"
+    )
+    return parser.parse_args(arguments)
+
+
+def _compared(
+    framing: str, folder: Path, options: argparse.Namespace
+) -> Iterator[tuple[Row, list[np.ndarray]]]:
+    """Every contestant's rows on one mannequin, and a strip of pictures each."""
+    words = {
+        "artifacts": str(folder), "ingest.mannequin_motion": MOTION[framing], "ingest.mannequin_views": "",
+        "ingest.mannequin_frames": "16" if options.quick else "40", "ingest.test_frames": "4",
+        "train.iterations": "100" if options.quick else "500", "auxiliary.frames": "24",
+        "auxiliary.texture_guidance": "false", "train.held_out_frames": "0",
+    }  # fmt: skip
+    words |= dict(word.split("=", 1) for word in options.words)
+    base = job_from_words(f"mannequin_{framing}", words)
+    ingest, fit = _made(base, "ingest"), _made(base, "fit")
+    scene = _scene(base)
+    truth = folder / f"truth_{framing}"
+    if not truth.is_dir():
+        _write_truth(truth, scene, ingest, fit, 24)
+    network = Lpips(base.workspace.assets / "lpips", "alex")
+    for name in options.contestants.split(","):
+        own = CONTESTANTS[name]
+        if own["auxiliary.generator"] == "folder":
+            own = {**own, "auxiliary.folder": str(truth), "auxiliary.check": "false"}
+        job = job_from_words(base.subject.name, {**words, **own})
+        for stage in ("plan", "auxiliary"):
+            if stage in job.stages:
+                _made(job, stage)
+        avatar = load_avatar(_made(job, "train").folder / "avatar.safetensors", _body(job)).eval()
+        strip: list[np.ndarray] = []
+        rows = [_scored(avatar, scene, ingest, fit, side, network, strip) for side in ("seen", "unseen")]
+        for place, (side, scores) in enumerate(zip(("seen", "unseen"), rows, strict=True)):
+            yield Row(framing, name, side, *scores), [np.concatenate(strip, axis=1)] if place else []
+
+
+def _made(job: Job, stage: str) -> Artifact:
+    return job.find(stage) or run_stage(job, stage)
+
+
+def _body(job: Job):
+    return load_body(job.workspace.body_file)
+
+
+def _scene(job: Job) -> Scene:
+    """The mannequin before the cameras, the same as ingest filmed."""
+    body = _body(job)
+    return Filming(spec_of(job.settings["ingest"]), body, load_landmarks(body, job.workspace.body)).scene
+
+
+def around(scene: Scene, degrees: float) -> Camera:
+    """The pipeline's camera carried about the middle of what is framed, towards the subject's left."""
+    about = roma.rotvec_to_rotmat(torch.tensor([0.0, math.radians(degrees), 0.0]))
+    shot = scene.shot
+    rotation = shot.camera.rotation @ about.mT
+    place = shot.centre + about @ (shot.camera.centre - shot.centre)
+    return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
+
+
+def _filmed(scene: Scene, frame: int, camera: Camera) -> Picture:
+    return film(scene, frame, camera, make_background(camera, scene.seed))
+
+
+def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, count: int) -> None:
+    """The truth's own pictures of all sides, at moments of the clip, in the layout of auxiliary.folder."""
+    train, poses = read_split(ingest.folder / "split.json").train, read_poses(fit.folder / "poses.parquet")
+    for kind in ("frames", "masks"):
+        (folder / kind).mkdir(parents=True)
+    cameras, rows = {}, []
+    for number in range(count):
+        frame, camera = train[number * len(train) // count], around(scene, 360 * number / count)
+        picture = _filmed(scene, frame, camera)
+        write_frame(folder / "frames", number, picture.image)
+        write_mask(folder / "masks", number, picture.mask)
+        cameras[number] = camera
+        rows.append(poses.index(frame))
+    chosen = Poses(tuple(range(count)), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
+    write_poses(folder / "poses.parquet", chosen)
+    write_cameras(folder / "cameras.parquet", cameras)
+
+
+@torch.no_grad()
+def _scored(
+    avatar: Avatar,
+    scene: Scene,
+    ingest: Artifact,
+    fit: Artifact,
+    side: str,
+    network: Lpips,
+    strip: list[np.ndarray],
+) -> tuple[float, float, float]:
+    """Mean PSNR, SSIM and LPIPS over the held-out frames; pictures of the first are added to ``strip``."""
+    poses = read_poses(fit.folder / "poses.parquet")
+    scores = []
+    for frame in read_split(ingest.folder / "split.json").test:
+        row = poses.index(frame)
+        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        for degrees in UNSEEN if side == "unseen" else (0.0,):
+            camera = around(scene, degrees)
+            picture = _filmed(scene, frame, camera)
+            target = composite(picture.image, picture.mask)
+            image = render(gaussians, camera).color.clamp(0, 1)
+            part = _box(picture.mask)
+            pair = image[part], target[part]
+            scores.append((psnr(*pair), ssim(*pair), network(*pair)))
+            if len(scores) <= 3:
+                both = torch.cat([image, target]) * 255
+                strip.append(
+                    cv2.resize(both.round().byte().numpy(), (192, 384), interpolation=cv2.INTER_AREA)
+                )
+    return tuple(np.mean(scores, axis=0).tolist())  # type: ignore[return-value]
+
+
+def _box(mask: np.ndarray) -> tuple[slice, slice]:
+    """The person's rows and columns with a margin."""
+    parts = []
+    for axis, length in ((1, mask.shape[0]), (0, mask.shape[1])):
+        inside = np.flatnonzero((mask > 127).any(axis))
+        parts.append(slice(max(0, inside[0] - MARGIN), min(length, inside[-1] + 1 + MARGIN)))
+    return parts[0], parts[1]
+
+
+def _print(rows: list[Row]) -> None:
+    print(machine.described())
+    print(f"{'framing':8} {'contestant':12} {'side':7} {'PSNR':>6} {'SSIM':>7} {'LPIPS':>7}")
+    for row in rows:
+        print(
+            f"{row.framing:8} {row.contestant:12} {row.side:7} "
+            f"{row.psnr:6.2f} {row.ssim:7.4f} {row.lpips:7.4f}"
+        )
+
+
+def _headline(rows: list[Row]) -> str:
+    """The texture's gain over none on either side, framing by framing."""
+    found = {(row.framing, row.contestant, row.side): row.psnr for row in rows}
+    parts = []
+    for framing in dict.fromkeys(row.framing for row in rows):
+        for name in ("texture 0.1", "truth 0.1"):
+            gains = [
+                f"{side} {found[framing, name, side] - found[framing, 'none', side]:+.2f} dB"
+                for side in ("unseen", "seen")
+                if (framing, name, side) in found and (framing, "none", side) in found
+            ]
+            parts += [f"{framing} {name}: {', '.join(gains)}"] if gains else []
+    return "auxiliary views over none: " + "; ".join(parts)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

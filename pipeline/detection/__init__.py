@@ -1,0 +1,1 @@
+"""What is detected of a person in a picture: MediaPipe's landmarks and segmentations."""

@@ -1,0 +1,192 @@
+"""From a generator's offer to the frames that are learnt from: looked at, registered, checked, counted."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.body import Landmarks, Poses, pose_body
+from pipeline.camera import Camera
+from pipeline.frames import read_mask, write_frame, write_mask
+from stages.auxiliary import check
+from stages.auxiliary.look import Look, Watcher
+from stages.auxiliary.offer import Offer, Picture
+from stages.auxiliary.register import register
+from stages.auxiliary.skeleton import driven_keypoints
+from stages.auxiliary.turn import Clip
+
+if TYPE_CHECKING:
+    from pipeline.stage import Context
+
+
+@dataclasses.dataclass(frozen=True)
+class Accepted:
+    """What is left of an offer. The pictures are in ``folder``, uncropped.
+
+    Attributes:
+        folder: with ``frames`` and ``masks``.
+        poses: of the kept frames, registered.
+        cameras: of each.
+        keypoints: [T, 133, 3], of the uncropped pictures.
+        offered: how many frames there were.
+        refused: reason -> how many.
+        identity: each kept frame's distance from the subject's face; None where none was compared.
+        notes: what a reader of the counts should know.
+    """
+
+    folder: Path
+    poses: Poses
+    cameras: dict[int, Camera]
+    keypoints: np.ndarray
+    offered: int
+    refused: dict[str, int]
+    identity: dict[int, float | None]
+    notes: tuple[str, ...] = ()
+
+
+def accept_exact(context: Context, clip: Clip, landmarks: Landmarks, offer: Offer, total: int) -> Accepted:
+    """Take an offer whose pictures show their poses by construction; its keypoints are the poses' own."""
+    folder, frames, points = _made(context), [], []
+    with context.progress(total, "frames") as progress:
+        for picture in offer.pictures:
+            _keep(folder, picture, picture.mask)
+            vertices, joints = posed(clip, offer.poses, offer.poses.index(picture.frame))
+            camera = offer.cameras[picture.frame]
+            points.append(driven_keypoints(clip, landmarks, joints, vertices, camera))
+            frames.append(picture.frame)
+            progress.advance()
+    return Accepted(
+        folder=folder,
+        poses=rows_of(offer.poses, frames),
+        cameras={frame: offer.cameras[frame] for frame in frames},
+        keypoints=np.stack(points) if points else np.zeros((0, 133, 3), np.float32),
+        offered=len(frames),
+        refused={},
+        identity=dict.fromkeys(frames),
+    )
+
+
+def accept_checked(context: Context, clip: Clip, landmarks: Landmarks, offer: Offer) -> Accepted:
+    """Look at an offer, throw out what does not fit, and register the rest."""
+    settings, folder, watcher = context.settings, _made(context), Watcher(context)
+    looks: list[Look] = []
+    with context.progress(len(offer.poses), "looking") as progress:
+        for picture in offer.pictures:
+            look = watcher.look(picture)
+            _keep(folder, picture, look.mask)
+            looks.append(dataclasses.replace(look, mask=np.zeros((0, 0), np.uint8)))
+            progress.advance()
+    driving = _driving(clip, landmarks, offer, looks)
+    subject = watcher.subject(clip)
+    reasons = _first_reasons(looks, driving, subject, settings)
+    left = [row for row, reason in enumerate(reasons) if reason is None]
+    frames = [looks[row].frame for row in left]
+    poses = rows_of(offer.poses, frames)
+    if settings.register and left:
+        usable = [check.usable_points(looks[row].keypoints, driving.matched[row]) for row in left]
+        cameras = [offer.cameras[frame] for frame in frames]
+        poses = register(clip, landmarks, poses, cameras, np.stack(usable))
+    for place, row in enumerate(left):
+        frame = looks[row].frame
+        mask = read_mask(folder / "masks", frame)
+        vertices = posed(clip, poses, place)[0]
+        if not check.mask_fits(clip, vertices, offer.cameras[frame], mask, settings):
+            reasons[row] = check.MASK
+    kept = [row for row in left if reasons[row] is None]
+    frames = [looks[row].frame for row in kept]
+    notes = (
+        ()
+        if subject is not None
+        else ("no face in the clip is large enough to be known again: identity was not checked",)
+    )
+    return Accepted(
+        folder=folder,
+        poses=rows_of(poses, frames),
+        cameras={frame: offer.cameras[frame] for frame in frames},
+        keypoints=np.stack([looks[row].keypoints for row in kept])
+        if kept
+        else np.zeros((0, 133, 3), np.float32),
+        offered=len(looks),
+        refused=dict(sorted(Counter(reason for reason in reasons if reason).items())),
+        identity={looks[row].frame: driving.identity[row] for row in kept},
+        notes=notes,
+    )
+
+
+@dataclasses.dataclass
+class _Driving:
+    """What the driving poses say of each looked-at frame."""
+
+    matched: list[check.Matched]
+    cosines: list[float]
+    identity: list[float | None] = dataclasses.field(default_factory=list)
+
+
+def _driving(clip: Clip, landmarks: Landmarks, offer: Offer, looks: list[Look]) -> _Driving:
+    matched, cosines = [], []
+    for look in looks:
+        row, camera = offer.poses.index(look.frame), offer.cameras[look.frame]
+        vertices, joints = posed(clip, offer.poses, row)
+        driven = driven_keypoints(clip, landmarks, joints, vertices, camera)
+        place = check.mean_place(vertices)
+        cosines.append(check.head_facing(clip, offer.poses.rotation[row], camera, place))
+        matched.append(check.match(look.keypoints, driven, cosines[-1]))
+    return _Driving(matched, cosines)
+
+
+def _first_reasons(
+    looks: list[Look], driving: _Driving, subject: np.ndarray | None, settings
+) -> list[str | None]:
+    """Why each frame is refused before it is registered, or None."""
+    limit = settings.identity_distance
+    driving.identity, stranger = check.other_faces(looks, driving.cosines, subject, limit)
+    flickers = check.flickering(looks, settings.flicker)
+    reasons: list[str | None] = []
+    for row, look in enumerate(looks):
+        face = driving.identity[row]
+        if not look.found:
+            reasons.append(check.NOBODY)
+        elif stranger or (face is not None and face > limit):
+            reasons.append(check.FACE_OF)
+        elif driving.matched[row].distance > settings.keypoint_distance:
+            reasons.append(check.POSE)
+        elif check.wrong_way(look, driving.cosines[row]):
+            reasons.append(check.AWAY)
+        else:
+            reasons.append(check.FLICKER if flickers[row] else None)
+    return reasons
+
+
+@torch.no_grad()
+def posed(clip: Clip, poses: Poses, row: int) -> tuple[Tensor, Tensor]:
+    """Vertices [V, 3] and joints [55, 3] of one row of some poses."""
+    one = slice(row, row + 1)
+    vertices, joints = pose_body(
+        clip.body, clip.identity, poses.rotation[one], poses.expression[one], poses.transl[one]
+    )
+    return vertices[0], joints[0]
+
+
+def rows_of(poses: Poses, frames: list[int]) -> Poses:
+    """The poses of some frames."""
+    rows = [poses.index(frame) for frame in frames]
+    return Poses(tuple(frames), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
+
+
+def _made(context: Context) -> Path:
+    folder = context.work / "made"
+    for kind in ("frames", "masks"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _keep(folder: Path, picture: Picture, mask: np.ndarray | None) -> None:
+    write_frame(folder / "frames", picture.frame, picture.image)
+    whole = np.full(picture.image.shape[:2], 255, np.uint8) if mask is None else mask
+    write_mask(folder / "masks", picture.frame, whole)

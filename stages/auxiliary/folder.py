@@ -1,0 +1,227 @@
+"""Frames that somebody made elsewhere: our own layout, the peers' ``_gen`` folder, pictures, or a video.
+
+- our layout: ``frames/``, ``poses.parquet`` and ``cameras.parquet``, and ``masks/`` if there are any, as
+  the guidance folder has them, or of any other motion and cameras in the clip's world;
+- the peers': ``frames/<id>.png``, ``smplx_optimized/smplx_params/<id>.json``, ``cam_params/<id>.json``,
+  and where they are there ``masks/``, ``keypoints_whole_body/`` and ``frame_list_train.txt``, which says
+  which frames are meant. Ids are the frames' numbers plus 100,000;
+- a folder of pictures or a video: frame k shows frame k of the guidance, spread over all of it where
+  there are fewer. A video is of the guidance's size; MimicMotion's output is.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from pipeline.body import Poses, read_poses, rest_joints
+from pipeline.camera import Camera, facing_camera
+from pipeline.errors import UserError
+from pipeline.keypoints import COUNT
+from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
+from pipeline.records import read_cameras, read_json
+from stages.auxiliary.offer import Offer, Picture
+from stages.auxiliary.turn import ID_OFFSET, Clip, Turn
+
+PICTURES = (".png", ".jpg", ".jpeg")
+_NUMBER = re.compile(r"(?:.*\D)?(\d+)")
+_REMEDY = "see docs/auxiliary.md for the layouts that auxiliary.folder may have"
+_LARGEST = 1e6
+
+
+def read_folder(path: Path, clip: Clip, turn: Turn, body_file: Path) -> Offer:
+    """What lies at ``path``, whichever layout it has.
+
+    Raises:
+        UserError: there is nothing there, or it cannot be read.
+    """
+    if path.is_file():
+        return _video(path, turn)
+    if not path.is_dir():
+        raise UserError(f"{path} does not exist: {_REMEDY}")
+    frames = path / "frames" if (path / "frames").is_dir() else path
+    if (path / "smplx_optimized" / "smplx_params").is_dir():
+        return _peers(path, frames, clip, body_file)
+    if (path / "poses.parquet").is_file():
+        return _ours(path, frames)
+    files = list(numbered(frames).values())
+    return Offer(turn.poses, _cameras(turn), _spread(files, turn))
+
+
+def numbered(folder: Path) -> dict[int, Path]:
+    """The numbered pictures of a folder, frame number -> file, in order; UserError if there are none."""
+    found: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = _NUMBER.fullmatch(file.stem)
+        if file.suffix.lower() in PICTURES and match:
+            found[int(match.group(1))] = file
+    if not found:
+        raise UserError(f"{folder} holds no numbered pictures: {_REMEDY}")
+    return dict(sorted(found.items()))
+
+
+def _ours(path: Path, frames: Path) -> Offer:
+    files, poses = numbered(frames), read_poses(path / "poses.parquet")
+    cameras = read_cameras(path / "cameras.parquet")
+    masks = numbered(path / "masks") if (path / "masks").is_dir() else {}
+    usable = [frame for frame in poses.frames if frame in files and frame in cameras]
+    if not usable:
+        raise UserError(f"{path}: no frame has a picture, a pose and a camera: {_REMEDY}")
+
+    def pictures() -> Iterator[Picture]:
+        for frame in usable:
+            mask = read_grey(masks[frame]) if frame in masks else None
+            yield Picture(frame, read_color(files[frame]), mask)
+
+    return Offer(poses, cameras, pictures())
+
+
+def _peers(path: Path, frames: Path, clip: Clip, body_file: Path) -> Offer:
+    """The peers' ``_gen`` folder; frames are those with a picture, a pose and a camera, and on the list."""
+    files = numbered(frames)
+    files = {frame % ID_OFFSET: file for frame, file in files.items()}
+    cameras = {number % ID_OFFSET: file for number, file in _by_number(path / "cam_params").items()}
+    listed = _listed(path / "frame_list_train.txt")
+    parameters = path / "smplx_optimized" / "smplx_params"
+    ids = {number % ID_OFFSET: number for number in _by_number(parameters)}
+    usable = sorted({*files} & {*cameras} & {*ids} & (listed if listed is not None else {*files}))
+    if not usable:
+        raise UserError(f"{path}: no frame has a picture, a pose and a camera: {_REMEDY}")
+    read = read_initial_poses(parameters, [ids[frame] for frame in usable], read_hand_mean(body_file))
+    if read.transl is None:
+        raise UserError(f"{parameters}: its files have no 'trans': {_REMEDY}")
+    sizes = {frame: read_color(files[frame]).shape for frame in usable}
+    views = {frame: _peer_camera(cameras[frame], sizes[frame]) for frame in usable}
+    # Their world is OpenCV's camera, ours has Y up: cameras are carried over, and bodies with them.
+    rotation = torch.stack([views[frame].rotation for frame in usable])
+    translation = torch.stack([views[frame].translation for frame in usable])
+    theirs, ours = tool_joints(clip.body, clip.identity)[0], rest_joints(clip.body, clip.identity)[0]
+    orient, transl = into_world(read.rotation[:, 0], read.transl, theirs, rotation, translation)
+    turned = read.rotation.clone()
+    turned[:, 0] = orient.float()
+    width = clip.poses.expression.shape[1]
+    expression = torch.zeros(len(usable), width)
+    if read.expression is not None:
+        shared = min(width, read.expression.shape[1])
+        expression[:, :shared] = read.expression[:, :shared]
+    poses = Poses(tuple(usable), turned, expression, moved_pivot(orient, transl, theirs, ours).float())
+    return Offer(poses, views, _peer_pictures(path, files, usable))
+
+
+def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Iterator[Picture]:
+    folders = {name: path / name for name in ("masks", "keypoints_whole_body")}
+    masks, points = (
+        {number % ID_OFFSET: file for number, file in _by_number(folder).items()}
+        for folder in folders.values()
+    )
+    for frame in usable:
+        mask = read_grey(masks[frame]) if frame in masks else None
+        keypoints = _whole_body(points[frame]) if frame in points else None
+        yield Picture(frame, read_color(files[frame]), mask, keypoints)
+
+
+def _peer_camera(path: Path, size: tuple[int, ...]) -> Camera:
+    value = read_json(path, _REMEDY)
+    try:
+        rotation, translation = np.array(value["R"], float), np.array(value["t"], float).reshape(3)
+        focal, centre = (np.array(value[name], float).reshape(2) for name in ("focal", "princpt"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} lacks or misspells {error}: {_REMEDY}") from None
+    proper = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    if not proper or focal.min() <= 0:
+        raise UserError(f"{path}: R is no rotation, or a focal length is not positive: {_REMEDY}")
+    upright = facing_camera(size[1], size[0], 1.0).rotation.double().numpy()
+    intrinsics = torch.tensor([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]).float()
+    turned = torch.from_numpy(rotation @ upright).float()
+    return Camera(size[1], size[0], intrinsics, turned, torch.from_numpy(translation).float())
+
+
+def _video(path: Path, turn: Turn) -> Offer:
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    except (av.FFmpegError, IndexError) as error:
+        raise UserError(f"{path} cannot be read as a video ({error}): {_REMEDY}") from None
+    if not images:
+        raise UserError(f"{path} holds no frame: {_REMEDY}")
+    return Offer(turn.poses, _cameras(turn), _fitted(images, turn))
+
+
+def _spread(files: list[Path], turn: Turn) -> Iterator[Picture]:
+    for place, frame in _places(len(files), turn):
+        yield Picture(frame, to_size(read_color(files[place]), turn.camera))
+
+
+def _fitted(images: list[np.ndarray], turn: Turn) -> Iterator[Picture]:
+    for place, frame in _places(len(images), turn):
+        yield Picture(frame, to_size(images[place], turn.camera))
+
+
+def _places(count: int, turn: Turn) -> list[tuple[int, int]]:
+    """Which picture shows which frame of the turn: all of it, or evenly spread."""
+    frames = turn.poses.frames
+    if count >= len(frames):
+        return [(place, frame) for place, frame in enumerate(frames)]
+    return [(place, frames[place * len(frames) // count]) for place in range(count)]
+
+
+def _cameras(turn: Turn) -> dict[int, Camera]:
+    return dict.fromkeys(turn.poses.frames, turn.camera)
+
+
+def to_size(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """A picture resampled to a camera's size."""
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+
+def read_color(path: Path) -> np.ndarray:
+    """[H, W, 3] uint8 RGB; UserError if the file is no picture."""
+    return np.ascontiguousarray(_decoded(path, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """[H, W] uint8; UserError if the file is no picture."""
+    return _decoded(path, cv2.IMREAD_GRAYSCALE)
+
+
+def _decoded(path: Path, flags: int) -> np.ndarray:
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, flags) if data.size else None
+    if image is None:
+        raise UserError(f"{path} is not a readable picture: replace it or take it out")
+    return image
+
+
+def _by_number(folder: Path) -> dict[int, Path]:
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return {int(match.group(1)): file for file in files if (match := _NUMBER.fullmatch(file.stem))}
+
+
+def _listed(path: Path) -> set[int] | None:
+    if not path.is_file():
+        return None
+    try:
+        return {int(line) % ID_OFFSET for line in path.read_text(encoding="utf-8").split()}
+    except ValueError as error:
+        raise UserError(f"{path} must hold a frame number a line ({error})") from None
+
+
+def _whole_body(path: Path) -> np.ndarray:
+    value = read_json(path, _REMEDY)
+    try:
+        points = np.array(value, np.float32)
+    except (TypeError, ValueError):
+        points = np.zeros(0, np.float32)
+    if points.shape != (COUNT, 3) or not (np.abs(points) < _LARGEST).all():
+        raise UserError(f"{path} does not hold {COUNT} points of x, y, score: {_REMEDY}")
+    points[:, 2] = np.clip(points[:, 2], 0, 1)
+    return points

@@ -1,0 +1,12 @@
+"""MimicMotion on the parts of Stable Video Diffusion that diffusers has; the extra ``diffusion``.
+
+No weights are to be had where this was written: shapes, tiling, blending, determinism and loading are
+tested with tiny random weights, and no real ones were ever run.
+"""
+
+from stages.auxiliary.mimicmotion.denoising import animate
+from stages.auxiliary.mimicmotion.model import Model, load_model
+from stages.auxiliary.mimicmotion.pose_net import PoseNet
+from stages.auxiliary.mimicmotion.tiles import tile_weights, tiles
+
+__all__ = ["Model", "PoseNet", "animate", "load_model", "tile_weights", "tiles"]

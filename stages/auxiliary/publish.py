@@ -1,0 +1,139 @@
+"""What training reads: cropped frames with masks, trust, cameras and poses of their own, and the counts."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+
+from pipeline.body import write_poses
+from pipeline.camera import Camera
+from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.records import write_cameras, write_json
+from stages.auxiliary.accept import Accepted, posed, rows_of
+from stages.auxiliary.crop import Framing, crop
+from stages.auxiliary.texture import FineSurface
+from stages.auxiliary.turn import ID_OFFSET, Clip
+
+if TYPE_CHECKING:
+    from pipeline.stage import Context
+
+NOTHING_NEW = "shows nothing that the clip does not"
+OUT_OF_FRAME = "shows nothing of what the clip frames"
+LEAST_NEWS = 0.05  # of the person's pixels; a frame with less teaches nothing
+_SHEET, _TILE = 8, 256  # frames of the contact sheet, and pixels of their height
+
+
+def publish(
+    context: Context,
+    clip: Clip,
+    accepted: Accepted,
+    framing: Framing,
+    surface: FineSurface,
+    known: np.ndarray,  # [N]
+) -> None:
+    """Crop the accepted frames to the clip's framing and write them.
+
+    Args:
+        context: the stage's.
+        clip: the person.
+        accepted: the frames.
+        framing: what the clip frames.
+        surface: the fine mesh.
+        known: of its vertices, whether the clip shows it.
+    """
+    settings, output = context.settings, context.output
+    for kind in ("frames", "masks", "trust"):
+        (output / kind).mkdir()
+    carried = torch.cat(
+        [torch.from_numpy(1 - known.astype(np.float32))[:, None], surface.refine(framing.shown[:, None])],
+        dim=1,
+    )
+    cameras: dict[int, Camera] = {}
+    refused, sheet = dict(accepted.refused), []
+    with context.progress(len(accepted.poses), "crops") as progress:
+        for row, frame in enumerate(accepted.poses.frames):
+            image = read_frame(accepted.folder / "frames", frame)
+            mask = read_mask(accepted.folder / "masks", frame)
+            vertices = posed(clip, accepted.poses, row)[0]
+            made = crop(image, mask, accepted.cameras[frame], vertices, surface, carried, framing)
+            reason = OUT_OF_FRAME if made is None else NOTHING_NEW if made.news < LEAST_NEWS else None
+            if reason == NOTHING_NEW and not settings.unseen_only:
+                reason = None
+            if made is None or reason is not None:
+                refused[str(reason)] = refused.get(str(reason), 0) + 1
+            else:
+                trust = made.trust if settings.unseen_only else np.full_like(made.trust, 255)
+                write_frame(output / "frames", ID_OFFSET + frame, made.image)
+                write_mask(output / "masks", ID_OFFSET + frame, made.mask)
+                write_mask(output / "trust", ID_OFFSET + frame, trust)
+                cameras[frame] = made.camera
+                sheet.append(tile(made.image, made.mask, trust))
+            progress.advance()
+    write_records(context, accepted, cameras, refused)
+    if sheet:
+        chosen = [sheet[k * len(sheet) // min(_SHEET, len(sheet))] for k in range(min(_SHEET, len(sheet)))]
+        write_png(output / "preview.png", side_by_side(chosen))
+
+
+def write_records(
+    context: Context, accepted: Accepted, cameras: dict[int, Camera], refused: dict[str, int]
+) -> None:
+    """Write cameras, poses, keypoints and ``auxiliary.json`` of the frames that have a camera."""
+    output, frames = context.output, sorted(cameras)
+    numbers = tuple(ID_OFFSET + frame for frame in frames)
+    poses = dataclasses.replace(rows_of(accepted.poses, frames), frames=numbers)
+    write_poses(output / "poses.parquet", poses)
+    write_cameras(output / "cameras.parquet", {ID_OFFSET + frame: cameras[frame] for frame in frames})
+    table = empty_keypoints(np.array(numbers, np.int64))
+    for row, frame in enumerate(frames):
+        points = accepted.keypoints[accepted.poses.frames.index(frame)]
+        table.whole_body[row] = moved(points, accepted.cameras[frame], cameras[frame])
+    write_keypoints(output / "keypoints.parquet", table)
+    distances = [value for frame in frames if (value := accepted.identity.get(frame)) is not None]
+    write_json(
+        output / "auxiliary.json",
+        {
+            "generator": context.settings.generator,
+            "offered": accepted.offered,
+            "kept": len(frames),
+            "refused": dict(sorted(refused.items())),
+            "identity_distance": round(float(np.median(distances)), 4) if distances else None,
+            "notes": list(accepted.notes),
+        },
+    )
+    counted = ", ".join(f"{count} {reason}" for reason, count in sorted(refused.items()))
+    context.log(
+        f"{len(frames)} of {accepted.offered} frames kept" + (f"; refused: {counted}" if counted else "")
+    )
+
+
+def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
+    """Keypoints [133, 3] of a picture in a crop of it, those outside with score 0."""
+    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
+    shift = target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
+    placed = points.copy()
+    placed[:, :2] = points[:, :2] * scale + shift
+    inside = (placed[:, :2] >= 0).all(1) & (placed[:, 0] < target.width) & (placed[:, 1] < target.height)
+    placed[:, 2] *= inside
+    placed[placed[:, 2] <= 0] = 0
+    return placed
+
+
+def tile(image: np.ndarray, mask: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    """A frame for the contact sheet: the person on grey, and below it what is learnt from it."""
+    alpha = mask[..., None] / np.float32(255)
+    person = image * alpha + 208 * (1 - alpha)
+    learnt = person * (0.25 + 0.75 * trust[..., None] / np.float32(255))
+    both = np.concatenate([person, learnt]).astype(np.uint8)
+    scale = 2 * _TILE / both.shape[0]
+    return cv2.resize(both, (max(1, round(both.shape[1] * scale)), 2 * _TILE), interpolation=cv2.INTER_AREA)
+
+
+def side_by_side(tiles: list[np.ndarray]) -> np.ndarray:
+    """Tiles of equal height in a row."""
+    return np.concatenate(tiles, axis=1)

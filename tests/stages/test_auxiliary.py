@@ -1,0 +1,343 @@
+"""The auxiliary stage: guidance, the texture, the crop, folders of others, and when nothing is made."""
+
+import dataclasses
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body import joint_index, read_poses, rest_joints
+from pipeline.camera import project
+from pipeline.errors import UserError
+from pipeline.frames import read_frame, read_mask, write_frame, write_video
+from pipeline.keypoints import FACE, read_keypoints
+from pipeline.plan import write_plan
+from pipeline.records import read_cameras
+from stages.auxiliary import run as stage
+from stages.auxiliary import texture
+from stages.auxiliary.accept import posed
+from stages.auxiliary.crop import find_framing
+from stages.auxiliary.folder import read_folder
+from stages.auxiliary.publish import NOTHING_NEW
+from stages.auxiliary.reference import score_frames
+from stages.auxiliary.settings import AuxiliarySettings
+from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turn_keypoints
+from stages.auxiliary.texture.complete import membrane, neighbours
+from stages.auxiliary.texture.project import Seen, robust_mean, weighted_median
+from stages.auxiliary.turn import ID_OFFSET, make_turn
+from tests.plans import plan_of
+from tests.stages.auxiliary_subject import BODY_FILE, body_and_landmarks, context_for, read, write_clip
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    return write_clip(tmp_path_factory.mktemp("full"))
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    return write_clip(tmp_path_factory.mktemp("head"), "head")
+
+
+@pytest.fixture(scope="module")
+def painted(full, tmp_path_factory):
+    """The stage's whole result with the texture generator."""
+    context = context_for(full, tmp_path_factory.mktemp("out") / "painted", generator="texture")
+    stage.run(context)
+    return context
+
+
+def small(**changes):
+    return AuxiliarySettings(frames=8, width=144, height=256, **changes)
+
+
+# The turn
+
+
+@pytest.mark.parametrize("motion", ["relaxed", "clip"])
+def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
+    clip = read(full)
+    turn = make_turn(clip, small(motion=motion))
+    pelvis = rest_joints(clip.body, clip.identity)[0]
+    headings = []
+    for row in range(8):
+        vertices, joints = posed(clip, turn.poses, row)
+        pixels = project(turn.camera, vertices)
+        assert bool((pixels >= 0).all()) and bool((pixels < torch.tensor([144.0, 256.0])).all())
+        assert torch.allclose(joints[0], pelvis + turn.poses.transl[row], atol=1e-5)
+        hips = joints[joint_index("left_hip")] - joints[joint_index("right_hip")]
+        headings.append(float(torch.atan2(-hips[2], hips[0])))
+    assert turn.azimuth == pytest.approx(np.arange(8) * np.pi / 4)
+    steps = np.diff(np.unwrap(headings))
+    assert steps == pytest.approx(np.full(7, np.pi / 4), abs=0.01 if motion == "relaxed" else 0.5)
+    assert headings[0] == pytest.approx(0, abs=0.01 if motion == "relaxed" else 0.5)
+
+
+def test_a_turned_away_face_has_no_points_and_a_hidden_limb_a_lower_score(full):
+    clip, landmarks = read(full), body_and_landmarks()[1]
+    points = turn_keypoints(clip, make_turn(clip, small()), landmarks)
+    assert points[0, FACE, 2].mean() > 0.9 and points[4, FACE, 2].mean() < 0.1
+    assert points[0, 0, 2] == 1 and points[4, 0, 2] == 0
+    assert np.isclose(points[2, :, 2], OCCLUDED).any()
+
+
+# Skeletons
+
+
+def test_eighteen_points_from_seventeen():
+    whole = np.zeros((133, 3), np.float32)
+    whole[:17, 0] = np.arange(17)
+    whole[5] = (10, 20, 0.9)
+    whole[6] = (30, 40, 0.5)
+    points = body_18(whole)
+    assert points[1].tolist() == [20, 30, 0.5]
+    assert points[[0, 2, 5, 8, 14], 0].tolist() == [0, 30, 10, 12, 2]
+
+
+def test_a_skeleton_is_drawn_by_confidence():
+    whole = np.zeros((133, 3), np.float32)
+    whole[5], whole[6] = (80, 40, 1.0), (20, 40, 1.0)
+    drawn = draw_skeleton(whole, 100, 100)
+    # The limb from the neck to the right shoulder is pure red at 0.6 of full brightness.
+    assert drawn[40, 35].tolist() == [153, 0, 0]
+    assert drawn[40, 20].tolist() == [255, 170, 0], "joints are not dimmed"
+    whole[[5, 6], 2] = 0.5
+    assert drawn[40, 35, 0] > draw_skeleton(whole, 100, 100)[40, 35, 0] > 60
+    whole[6, 2] = 0.29
+    assert not draw_skeleton(whole, 100, 100)[40, 35].any()
+    whole[FACE] = (50, 80, 1.0)
+    assert draw_skeleton(whole, 100, 100)[80, 50].tolist() == [255, 255, 255]
+
+
+# Texture
+
+
+def test_weighted_median_follows_the_weight():
+    values = np.array([[10], [20], [200]], np.uint8)
+    assert weighted_median(values, np.array([[1], [1], [1]], np.float32)) == 20
+    assert weighted_median(values, np.array([[1], [1], [5]], np.float32)) == 200
+
+
+def test_a_frame_that_slipped_is_outvoted():
+    colors = np.full((5, 1, 3), 100, np.uint8)
+    colors[0] = 250
+    assert robust_mean(colors, np.ones((5, 1), np.float32)) == pytest.approx(100)
+
+
+def test_the_membrane_is_straight_between_its_ends():
+    count = 11
+    chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
+    values, fixed = np.zeros((count, 1)), np.zeros(count, bool)
+    values[-1], fixed[[0, -1]] = 10, True
+    found = membrane(neighbours(chain, count), values, fixed, np.zeros(1))
+    assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-3)
+    again = membrane(neighbours(chain, count), values, fixed, np.zeros(1), start=found)
+    assert again == pytest.approx(found, abs=0.05)
+
+
+def test_a_part_without_a_known_neighbour_takes_the_mean():
+    pairs = np.array([[0, 1], [2, 3]])
+    fixed = np.array([True, False, False, False])
+    found = membrane(neighbours(pairs, 4), np.full((4, 1), 7.0), fixed, np.array([3.0]))
+    assert found[:, 0] == pytest.approx([7, 7, 3, 3], abs=1e-3)
+
+
+def test_the_unseen_side_is_the_mirror_of_the_seen_one():
+    """Known on the left only, with a pattern: the right gets the pattern, not a blur."""
+    body = body_and_landmarks()[0]
+    surface = texture.fine_surface(body, 0)
+    points = body.v_template.numpy()
+    pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
+    known = points[:, 0] > 0
+    seen = Seen(np.where(known[:, None], pattern, 0).astype(np.float32), known.astype(np.float32), known)
+    found = texture.complete(surface, seen)
+    right = points[:, 0] < -0.02
+    error = np.abs(found - pattern)[right]
+    assert np.median(error) < 5 and error.mean() < 12
+
+
+def test_projected_colours_are_those_of_the_frames(full):
+    """The textured body in a frame of the clip looks like that frame."""
+    clip, context = read(full), context_for(full, full / "projected")
+    surface = texture.fine_surface(clip.body, 1)
+    seen = texture.gather(clip, surface, clip.train[:3], context)
+    colors = texture.complete(surface, seen)
+    frame = clip.train[1]
+    image, mask, _ = texture.paint(clip.cameras[frame], surface, clip.vertices(frame), colors)
+    truth, inside = read_frame(clip.folder / "frames", frame), (mask > 250)
+    inside &= cv2.erode(read_mask(clip.folder / "masks", frame), np.ones((5, 5), np.uint8)) > 250
+    assert 0.1 < seen.known.mean() < 0.9
+    assert np.abs(image.astype(float) - truth)[inside].mean() < 12
+    overlap = (mask > 127) & (read_mask(clip.folder / "masks", frame) > 127)
+    assert overlap.sum() > 0.95 * (mask > 127).sum()
+
+
+# The whole stage
+
+
+def test_the_result_is_whole_and_its_numbers_are_their_own(painted):
+    output = painted.output
+    counts = json.loads((output / "auxiliary.json").read_text())
+    poses, cameras = read_poses(output / "poses.parquet"), read_cameras(output / "cameras.parquet")
+    assert counts["offered"] == 8 == counts["kept"] + sum(counts["refused"].values())
+    assert counts["kept"] == len(poses) > 2 and min(poses.frames) >= ID_OFFSET
+    assert {*poses.frames} == {*cameras} == {*read_keypoints(output / "keypoints.parquet").frames.tolist()}
+    for frame in poses.frames:
+        size = (cameras[frame].height, cameras[frame].width)
+        assert read_frame(output / "frames", frame).shape[:2] == size
+        assert read_mask(output / "trust", frame).shape == read_mask(output / "masks", frame).shape == size
+    assert set(counts["refused"]) <= {NOTHING_NEW}
+    assert ID_OFFSET + 4 in poses.frames, "the back is news"
+
+
+def test_the_camera_of_a_crop_sees_the_person_where_the_picture_has_it(full, painted):
+    clip, output = read(full), painted.output
+    poses, cameras = read_poses(output / "poses.parquet"), read_cameras(output / "cameras.parquet")
+    for row, frame in enumerate(poses.frames):
+        vertices = posed(clip, poses, row)[0]
+        pixels = project(cameras[frame], vertices).floor().long()
+        inside = (pixels >= 0).all(1) & (pixels[:, 0] < cameras[frame].width)
+        inside &= pixels[:, 1] < cameras[frame].height
+        mask = read_mask(output / "masks", frame)
+        on = mask[pixels[inside, 1].numpy(), pixels[inside, 0].numpy()] > 60
+        assert inside.float().mean() > 0.99 and on.mean() > 0.93
+
+
+def test_only_the_unseen_is_trusted(painted):
+    output = painted.output
+    frame = ID_OFFSET + 4
+    mask, trust = read_mask(output / "masks", frame) > 127, read_mask(output / "trust", frame) > 127
+    assert trust[mask].mean() > 0.7
+    frontal = min(read_poses(output / "poses.parquet").frames)
+    mask, other = read_mask(output / "masks", frontal) > 127, read_mask(output / "trust", frontal) > 127
+    assert other[mask].mean() < trust[read_mask(output / "masks", frame) > 127].mean()
+
+
+def test_guidance_can_be_handed_on(painted):
+    folder = painted.output / "guidance"
+    assert cv2.imread(str(folder / "reference.png")).shape == (256, 144, 3)
+    assert len(list((folder / "poses").glob("*.png"))) == 8
+    described = json.loads((folder / "guidance.json").read_text())
+    assert described["azimuth_degrees"][4] == 180 and described["reference"]["padded"] is False
+    assert (folder / "peers" / "smplx_optimized" / "smplx_params" / "7.json").is_file()
+
+
+def test_the_same_bytes_again(full, painted, tmp_path):
+    context = context_for(full, tmp_path / "again", generator="texture")
+    stage.run(context)
+    for path in sorted(painted.output.rglob("*")):
+        if path.is_file():
+            assert path.read_bytes() == (context.output / path.relative_to(painted.output)).read_bytes(), path
+
+
+def test_off_costs_nothing(full, tmp_path):
+    context = context_for(full, tmp_path / "off", generator="off")
+    context.inputs = {}
+    stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def test_auto_goes_by_the_plan(full, tmp_path):
+    context = context_for(full, tmp_path / "auto")
+    assert stage.chosen_generator(context) == "texture"
+    shutil.copytree(full / "plan", tmp_path / "plan")
+    write_plan(tmp_path / "plan" / "plan.json", plan_of(auxiliary_views=False))
+    context.inputs["plan"] = tmp_path / "plan"
+    assert stage.chosen_generator(context) == "off"
+
+
+def test_a_head_is_cropped_out_of_the_whole_body(head, tmp_path):
+    context = context_for(head, tmp_path / "head", generator="texture", frames=4)
+    stage.run(context)
+    output, clip = context.output, read(head)
+    shown = find_framing(clip).shown
+    assert 0.1 < shown.mean() < 0.8
+    cameras = read_cameras(output / "cameras.parquet")
+    # Never larger than the head is in the clip: 96 pixels.
+    assert all(max(camera.width, camera.height) <= 110 for camera in cameras.values())
+    assert json.loads((output / "guidance" / "guidance.json").read_text())["reference"]["padded"] is True
+    hips = rest_joints(clip.body, clip.identity)[0]
+    poses = read_poses(output / "poses.parquet")
+    for row, frame in enumerate(poses.frames):
+        place = project(cameras[frame], (hips + poses.transl[row])[None])[0]
+        assert place[1] > cameras[frame].height, "the hips are below the picture"
+
+
+def test_the_frontal_frame_is_the_reference(full):
+    scores = score_frames(read(full))
+    assert all(0 <= value <= 1 for score in scores for value in (score.facing, score.sharpness, score.mask))
+    assert [score.total for score in scores] == sorted((score.total for score in scores), reverse=True)
+
+
+# Folders
+
+
+def test_our_layout_and_pictures_alone(full, painted, tmp_path):
+    clip = read(full)
+    turn = make_turn(clip, small())
+    for row in range(4):
+        (tmp_path / "frames").mkdir(exist_ok=True)
+        write_frame(tmp_path / "frames", row, np.full((256, 144, 3), 10 * row, np.uint8))
+    offer = read_folder(tmp_path, clip, turn, BODY_FILE)
+    assert [picture.frame for picture in offer.pictures] == [0, 2, 4, 6], "spread over the turn"
+    for name in ("poses.parquet", "cameras.parquet"):
+        shutil.copy(painted.output / "guidance" / name, tmp_path / name)
+    offer = read_folder(tmp_path, clip, turn, BODY_FILE)
+    pictures = list(offer.pictures)
+    assert [picture.frame for picture in pictures] == [0, 1, 2, 3] and pictures[2].image[0, 0, 0] == 20
+
+
+def test_a_video(full, tmp_path):
+    clip = read(full)
+    turn = make_turn(clip, small())
+    write_video(tmp_path / "v.mp4", [np.full((128, 72, 3), 20 * k, np.uint8) for k in range(8)], 15)
+    pictures = list(read_folder(tmp_path / "v.mp4", clip, turn, BODY_FILE).pictures)
+    assert len(pictures) == 8 and pictures[3].image.shape == (256, 144, 3)
+    assert pictures[3].image.mean() == pytest.approx(60, abs=6)
+
+
+def test_the_peers_generated_folder(full, painted, tmp_path):
+    """What their tools would hold of our own turn comes back as the same bodies before the same cameras."""
+    clip = read(full)
+    turn = make_turn(clip, small())
+    peers = painted.output / "guidance" / "peers"
+    theirs = tmp_path / "x_gen"
+    for source in ("smplx_optimized/smplx_params", "cam_params"):
+        (theirs / source).mkdir(parents=True)
+        for file in (peers / source).glob("*.json"):
+            shutil.copy(file, theirs / source / f"{int(file.stem) + ID_OFFSET}.json")
+    (theirs / "frames").mkdir()
+    for row in range(8):
+        write_frame(theirs / "frames", row + ID_OFFSET, np.zeros((256, 144, 3), np.uint8))
+    (theirs / "frame_list_train.txt").write_text("100001\n100005\n")
+    offer = read_folder(theirs, clip, turn, BODY_FILE)
+    assert [picture.frame for picture in offer.pictures] == [1, 5] == list(offer.poses.frames)
+    for row, frame in enumerate(offer.poses.frames):
+        there = project(offer.cameras[frame], posed(clip, offer.poses, row)[0])
+        here = project(turn.camera, posed(clip, turn.poses, frame)[0])
+        assert torch.allclose(there, here, atol=0.05)
+
+
+def test_what_cannot_be_read_is_named(full, tmp_path):
+    clip = read(full)
+    turn = make_turn(clip, small())
+    with pytest.raises(UserError, match="does not exist"):
+        read_folder(tmp_path / "nothing", clip, turn, BODY_FILE)
+    with pytest.raises(UserError, match="no numbered pictures"):
+        read_folder(tmp_path, clip, turn, BODY_FILE)
+    (tmp_path / "v.mp4").write_bytes(b"no video")
+    with pytest.raises(UserError, match="cannot be read as a video"):
+        read_folder(tmp_path / "v.mp4", clip, turn, BODY_FILE)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"generator": "magic"}, {"generator": "folder"}, {"generator": "mimicmotion"}, {"frames": 3},
+     {"overlap": 71}, {"motion": "dance"}, {"flicker": 0.0}, {"texture_levels": 3}],
+)  # fmt: skip
+def test_settings_that_cannot_work_are_refused(changes):
+    with pytest.raises(ValueError, match="auxiliary"):
+        dataclasses.replace(AuxiliarySettings(), **changes)
