@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.body import load_body
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.person import WINDOW
@@ -167,8 +168,6 @@ def test_azimuths_that_no_frame_shows(clip, degrees, widest, count):
 
 
 def measure_body():
-    from pipeline.body import load_body
-
     return load_body(BODY_FILE)
 
 
