@@ -13,11 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.avatar import Architecture, Avatar
+from pipeline.body import joint_transforms
 from pipeline.camera import Camera, facing_camera, project
 from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.metrics import composite
 from pipeline.records import read_cameras
 from pipeline.splat import Rendering, render
+from pipeline.visibility import body_in_frame
 from stages.train.loop import Trainer
 from stages.train.settings import TrainSettings
 
@@ -85,10 +88,6 @@ def _rendered(subject: Any, trainer: Trainer, row: int, camera: Camera) -> tuple
 
 def _seen_vertices(subject: Any) -> dict[str, Any]:
     """The body's surface, and which of its vertices at least a tenth of the training frames show."""
-    from pipeline.avatar import Architecture, Avatar
-    from pipeline.body import joint_transforms
-    from pipeline.visibility import body_in_frame
-
     inputs = subject.inputs
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
     surface = Avatar(inputs.body, inputs.identity, torch.arange(len(inputs.body.v_template)), bare).surfaces[

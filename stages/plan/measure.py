@@ -139,8 +139,8 @@ def pose_change(clip: Clip) -> float:
     Joints that are not seen are fitted to anything, so the fit's own angles say little here; the trusted
     keypoints of each frame are laid over their mean shape instead (moved, turned, scaled), and what is
     left is looked at. A detector's errors do not last, and movements do: so it is not the variance that is
-    taken but the covariance with what is left ``LAG`` frames later. The number is that of the point at
-    the 90th percentile, as a length.
+    taken but the covariance with what is left ``LAG`` frames later (in a clip too short to tell the two
+    apart, the variance). The number is that of the point at the 90th percentile, as a length.
     """
     points = clip.keypoints.whole_body[np.isin(clip.keypoints.frames, clip.split.train)]
     trusted = points[..., 2] >= TRUSTED
@@ -148,8 +148,9 @@ def pose_change(clip: Clip) -> float:
     trusted = trusted[:, often]
     places = np.where(trusted, points[:, often, 0] + 1j * points[:, often, 1], np.nan)
     usable = trusted.sum(1) >= LEAST_POINTS
-    if usable.sum() <= LAG:
+    if usable.sum() < 2:
         return 0.0
+    lag = LAG if usable.sum() > 4 * LAG else 0
     laid = places = places[usable]
     for _ in range(ALIGNMENTS):
         mean = np.nanmean(laid, 0)
@@ -157,7 +158,7 @@ def pose_change(clip: Clip) -> float:
     mean = np.nanmean(laid, 0)
     size = float(np.sqrt(np.mean(np.abs(mean - mean.mean()) ** 2)))
     left = laid - mean
-    lasting = np.real(left[LAG:] * np.conj(left[:-LAG]))
+    lasting = np.real(left[lag:] * np.conj(left[: len(left) - lag]))
     known = ~np.isnan(lasting).all(0)
     covariance = np.nanmean(lasting[:, known], 0).clip(min=0)
     return float(np.percentile(np.sqrt(covariance), 90)) / size if size and known.any() else 0.0

@@ -1,0 +1,184 @@
+"""The plan stage: what it measures, what it decides, and that every decision can be overridden."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body import load_body
+from pipeline.errors import UserError
+from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
+from pipeline.person import WINDOW
+from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
+from pipeline.records import Split, read_footage, write_footage, write_json, write_split
+from pipeline.settings import command_line_layer, resolve
+from pipeline.tables import write_table
+from stages.ingest.cameras.motion import MOVING
+from stages.plan import decide, measure
+from stages.plan.run import run
+from stages.plan.settings import PlanSettings
+from stages.train import losses
+from tests.stages.train_subject import BODY_FILE, FRAMES, write_subject
+
+AZIMUTH_CASES = [
+    ((), 360.0, 12),
+    ((0.0,), 330.0, 11),
+    (tuple(range(0, 360, 30)), 0.0, 0),
+    ((0.0, 180.0), 150.0, 10),
+    ((-20.0, 20.0), 270.0, 10),
+]
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """Six frames of a head whose mouth opens, as ingest and fit would publish them."""
+    write_subject(tmp_path)
+    keypoints = empty_keypoints(np.arange(FRAMES))
+    places = np.random.default_rng(0).uniform(8, 40, (68, 2))
+    for row in range(FRAMES):
+        keypoints.whole_body[row, FACE, :2] = places
+        keypoints.whole_body[row, FACE, 2] = 0.9
+        keypoints.whole_body[row, 71:91, 1] += 6 * np.sin(row / 2)
+    write_keypoints(tmp_path / "ingest" / "keypoints.parquet", keypoints)
+    columns = {"frame": np.arange(FRAMES, dtype=np.int32), "pixels": np.full(FRAMES, 0.8, np.float32)}
+    write_table(tmp_path / "fit" / "residuals.parquet", measure.RESIDUALS, columns)
+    write_json(tmp_path / "fit" / "face.json", {"source": "auto", "frames": 6, "registered": 5})
+    return tmp_path
+
+
+def context_of(clip, **settings):
+    output = clip / "out"
+    output.mkdir(exist_ok=True)
+    return SimpleNamespace(
+        inputs={name: clip / name for name in ("ingest", "fit")},
+        settings=PlanSettings(**settings),
+        body_file=BODY_FILE,
+        output=output,
+        log=lambda line: None,
+    )
+
+
+def planned(clip, **settings):
+    context = context_of(clip, **settings)
+    run(context)
+    return read_plan(context.output / "plan.json")
+
+
+def test_a_head_calls_for_what_a_head_has(clip):
+    plan = planned(clip)
+    on = {name for name in EFFECTS if plan.on(name)}
+    assert {"face_registration", "face_residual", "face_loss", "visibility_gate"} <= on
+    assert {"auxiliary_views", "pose_refinement", "pose_heads", "seen_head", "seen_face"} <= on
+    off = {"structure_from_motion", "test_time_refinement", "left_hand_residual", "right_hand_residual"}
+    assert not on & {*off, "seen_left_leg", "seen_right_leg", "seen_left_hand"}
+    assert not any(one.forced for one in plan.decisions)
+    assert 180.0 in plan["auxiliary_views"].values and 0.0 not in plan["auxiliary_views"].values
+    assert plan["face_registration"].measured == 5 and plan["pose_refinement"].measured == pytest.approx(0.8)
+
+
+def test_equal_inputs_give_equal_bytes(clip):
+    planned(clip)
+    first = (clip / "out" / "plan.json").read_bytes()
+    planned(clip)
+    assert (clip / "out" / "plan.json").read_bytes() == first
+
+
+@pytest.mark.parametrize("effect", [*DECIDED, *SEEN_PARTS])
+def test_any_decision_is_overridden_from_the_command_line(clip, effect):
+    usual = PLANS.setdefault("auto", planned(clip))[effect]
+    choice = "off" if usual.on else "on"
+    words = command_line_layer({f"plan.{effect}": choice})
+    settings = resolve({"plan": PlanSettings}, [words])["plan"]
+    made = planned(clip, **dataclasses.asdict(settings))[effect]
+    assert made.on != usual.on and made.forced and made.measured == usual.measured
+    assert f"plan.{effect}={choice}" in made.why and usual.why in made.why
+
+
+PLANS: dict = {}
+
+
+def test_a_part_that_is_said_to_be_unseen_gets_no_residual(clip):
+    plan = planned(clip, seen_face="off")
+    assert not plan.on("face_residual") and not plan["face_residual"].forced
+    assert planned(clip, seen_face="off", face_residual="on").on("face_residual")
+
+
+def test_what_ingest_and_fit_were_told_counts_as_set(clip):
+    write_json(clip / "fit" / "face.json", {"source": "off", "frames": 6, "registered": 0})
+    footage = read_footage(clip / "ingest" / "footage.json")
+    for camera, on, forced in (
+        ({"source": "sfm", "displacement": 0.07}, True, False),
+        ({"source": "pinhole", "displacement": 0.001}, False, False),
+        ({"source": "pinhole", "displacement": 0.07}, False, True),
+        ({"source": "sfm", "displacement": None}, True, True),
+    ):
+        write_footage(clip / "ingest" / "footage.json", dataclasses.replace(footage, camera=camera))
+        plan = planned(clip)
+        made = plan["structure_from_motion"]
+        assert (made.on, made.forced) == (on, forced)
+    assert plan["face_registration"].forced and not plan.on("face_loss")
+
+
+def test_one_training_frame_gives_a_plan(clip):
+    write_split(clip / "ingest" / "split.json", Split((2,), (5,)))
+    plan = planned(clip)
+    assert not plan.on("pose_heads") and plan.on("visibility_gate")
+    assert len(plan["auxiliary_views"].values) == 11
+
+
+@pytest.mark.parametrize("setting", [{"pose_heads": "maybe"}, {"seen_torso": ""}])
+def test_other_words_are_refused(setting):
+    with pytest.raises(ValueError, match="auto, on, off"):
+        PlanSettings(**setting)
+
+
+def test_there_is_a_setting_for_each_decision():
+    assert {field.name for field in dataclasses.fields(PlanSettings)} == {*DECIDED, *SEEN_PARTS}
+
+
+def test_numbers_that_stand_in_two_places_agree():
+    assert decide.BACKGROUND_MOTION == MOVING
+    assert losses.WINDOW == WINDOW
+
+
+@pytest.mark.parametrize(("degrees", "widest", "count"), AZIMUTH_CASES)
+def test_azimuths_that_no_frame_shows(clip, degrees, widest, count):
+    whole = measure.read_clip(clip / "ingest", clip / "fit", measure_body())
+    poses = whole.poses
+    rotation = poses.rotation[:1].repeat(max(1, len(degrees)), 1, 1)
+    for row, angle in enumerate(degrees):  # the body turned away by an angle is seen from minus that
+        rotation[row, 0] = torch.tensor([0.0, -np.deg2rad(angle), 0.0])
+    frames = tuple(range(len(rotation)))
+    transl = torch.tensor([0.0, 0.0, -3.0]).repeat(len(frames), 1)
+    turned = dataclasses.replace(
+        poses, frames=frames, rotation=rotation, transl=transl,
+        expression=poses.expression[:1].repeat(len(frames), 1), valid=None,
+    )  # fmt: skip
+    camera = whole.cameras[0]
+    changed = dataclasses.replace(
+        whole, poses=turned, cameras=dict.fromkeys(frames, camera),
+        split=Split(frames if degrees else (), ()),
+    )  # fmt: skip
+    found, unseen = measure.unseen_azimuths(changed, torch.zeros(55, 3))
+    assert (found, len(unseen)) == (widest, count)
+    for angle in degrees:
+        assert (30.0 * round(angle / 30)) % 360 not in unseen
+
+
+def measure_body():
+    return load_body(BODY_FILE)
+
+
+@pytest.mark.parametrize("name", ["fit/face.json", "fit/residuals.parquet", "ingest/keypoints.parquet"])
+def test_a_missing_file_is_named(clip, name):
+    (clip / name).unlink()
+    with pytest.raises(UserError, match=name.split("/")[1]):
+        planned(clip)
+
+
+def test_a_frame_without_a_pose_is_named(clip):
+    write_split(clip / "ingest" / "split.json", Split((0, 1, 9), ()))
+    with pytest.raises(UserError, match="frame 9"):
+        planned(clip)
