@@ -113,7 +113,7 @@ FAULTS = {  # (layout, file that must be named) -> what is done to the folder
         f / "SMPLX" / "mesh-f000003_smplx.pkl", lambda v: v.pop("transl")
     ),
     ("persona", "frame_idx_list.txt"): lambda f: put(f / "captured", "frame_idx_list.txt", "1e9\n"),
-    ("pose2sim", "Calib.toml"): lambda f: (f / "calibration" / "Calib.toml").write_text("[cam_01]\nmatrix = 3\n"),
+    ("pose2sim", "Calib.toml"): lambda f: put(f / "calibration", "Calib.toml", "[cam_01]\nmatrix = 3\n"),
 }  # fmt: skip
 
 
