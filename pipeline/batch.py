@@ -27,6 +27,7 @@ from pipeline.errors import UserError
 from pipeline.job import DEFAULT_PRESET, PLACES, Job, job_from_words, preset_path, workspace_from_words
 from pipeline.process import run_stage_process
 from pipeline.settings import convert, read_toml
+from pipeline.stage import Stage
 from pipeline.summary import Outcome, summary_lines
 from pipeline.workspace import REPOSITORY
 
@@ -72,7 +73,7 @@ def run_subject(subject: str, words: Mapping[str, str]) -> Outcome:
     start = time.monotonic()
     at = ""
     try:
-        for at in job_from_words(subject, words).stages:
+        for at in way(job_from_words(subject, words).stages):
             # A job of its own: what it has looked at is remembered, and changes when a stage is done.
             if is_current(job_from_words(subject, words), at):
                 continue
@@ -82,6 +83,14 @@ def run_subject(subject: str, words: Mapping[str, str]) -> Outcome:
     except UserError as error:
         return Outcome(subject, at or "settings", str(error), time.monotonic() - start)
     return Outcome(subject, seconds=time.monotonic() - start)
+
+
+def way(stages: Mapping[str, Stage]) -> list[str]:
+    """The stages that the last one needs, upstream first, and itself: what ``doit run`` runs."""
+    wanted = {list(stages)[-1]}
+    for name in reversed(list(stages)):
+        wanted.update(stages[name].needs if name in wanted else ())
+    return [name for name in stages if name in wanted]
 
 
 def is_current(job: Job, stage: str) -> bool:

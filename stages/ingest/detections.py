@@ -9,6 +9,7 @@ person with the highest mean score is taken.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def number_by_name(folder: Path, suffixes: tuple[str, ...], what: str) -> dict[i
     return numbered
 
 
-def check_frames(files: dict[int, Path], frames: set[int], complete: bool) -> None:
+def check_frames(files: Mapping[int, Path], frames: set[int], complete: bool) -> None:
     """Compare a folder's numbers with the clip's.
 
     Args:

@@ -156,7 +156,7 @@ def join_poses(poses: Sequence[InitialPoses | None]) -> InitialPoses | None:
     if not known or len(known) < len(poses):
         return None
     names = ("rotation", "expression", "transl", "valid", "hand_pca")
-    together = {
+    together: dict[str, Any] = {
         name: torch.cat([getattr(one, name) for one in known])
         for name in names
         if all(getattr(one, name) is not None for one in known)

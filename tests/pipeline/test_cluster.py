@@ -6,8 +6,9 @@ import time
 
 import pytest
 
-from pipeline.batch import Resources, fitting, import_ray, resources_of, without_dashboard
+from pipeline.batch import Resources, fitting, import_ray, resources_of, way, without_dashboard
 from pipeline.errors import UserError
+from pipeline.stage import Stage, load_stages
 from pipeline.workspace import REPOSITORY
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
@@ -117,6 +118,13 @@ def test_resources_come_from_the_preset_and_the_command_line(toy):
     assert resources_of({**words, "preset": "balanced"}) == Resources(1, 0)
     with pytest.raises(UserError, match="gpus=many"):
         resources_of({**words, "gpus": "many"})
+
+
+def test_a_batch_runs_what_doit_runs(toy):
+    stages = load_stages("tests.pipeline.toy_stages")
+    assert way(stages) == ["gather", "bend", "paint"]
+    aside = Stage("aside", 1, object, "nowhere:run", needs={"gather": ("*",)})
+    assert way({"gather": stages["gather"], "aside": aside, "bend": stages["bend"]}) == ["gather", "bend"]
 
 
 def test_what_no_machine_has_is_said_and_cpus_are_fitted(capsys):

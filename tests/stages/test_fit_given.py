@@ -9,16 +9,25 @@ import pytest
 import torch
 
 from pipeline.body import mean_identity, pose_body, read_identity, read_poses
+from pipeline.camera import Camera
 from pipeline.errors import UserError
-from pipeline.pose_files import RECORD, InitialPoses, read_record, with_flat_hands, write_record
+from pipeline.pose_files import (
+    RECORD,
+    InitialPoses,
+    read_hand_mean,
+    read_record,
+    with_flat_hands,
+    write_record,
+)
 from pipeline.stage import Context
+from stages.fit.pose_files import write_peer_files
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest
 from tests.stages import layout_writers as writers
 from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER
 from tests.stages.ingest_clips import make_context
-from tests.stages.layout_footage import COUNT, footage
+from tests.stages.layout_footage import COUNT, SIZE, footage
 from tests.unit.fake_body import write_official
 
 
@@ -103,6 +112,27 @@ def test_what_is_not_there_or_anothers_cannot_be_kept(tmp_path, ingested):
     write_record(bare / RECORD, dataclasses.replace(record, transl=None))
     with pytest.raises(UserError, match="no place"):
         fit(tmp_path / "placeless", bare, given="keep")
+
+
+def test_our_own_fit_goes_out_and_comes_back(tmp_path, shown):
+    """What fit.export_peers writes, with frames beside it, is a prepared folder."""
+    still = shown.still
+    cameras = {
+        row: Camera(
+            SIZE, SIZE, *(torch.from_numpy(a).float() for a in (still.matrix, still.rotation[row], shift))
+        )
+        for row, shift in enumerate(still.translation)
+    }
+    folder = tmp_path / "me"
+    mean = read_hand_mean(BODY_FILE)
+    write_peer_files(folder, shown.body, shown.identity, shown.poses, shown.poses, cameras, mean)
+    every = range(COUNT)
+    writers.pictures(folder / "frames", still.images, [f"{row}.png" for row in every])
+    writers.pictures(folder / "masks", still.masks, [f"{row}.png" for row in every])
+    writers.keypoint_files(folder / "keypoints_whole_body", still.keypoints, every)
+    context = make_context(tmp_path / "run", folder)
+    run_ingest(context)
+    assert surface_error(shown, fit(tmp_path / "fit", context.output, given="keep")) < 1e-4
 
 
 def pca_poses(coefficients):

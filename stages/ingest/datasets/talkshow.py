@@ -76,7 +76,7 @@ def _view(table: Any, path: Path) -> View:
     centre = number("center", (-1,))
     if min(size) < 1 or max(size) > 100_000 or focal[0] <= 0 or len(centre) < 2:
         raise UserError(f"{path}: its camera is empty: {_REMEDY}")
-    lens = pinhole_lens(*size, (focal[0], focal[-1]), (centre[0], centre[1]))
+    lens = pinhole_lens(size[0], size[1], (focal[0], focal[-1]), (centre[0], centre[1]))
     return View(lens, np.eye(3), np.zeros(3))
 
 
