@@ -204,7 +204,7 @@ def _scored(
             image = render(gaussians, camera).color.clamp(0, 1)
             part = _box(picture.mask)
             pair = image[part], target[part]
-            scores.append((psnr(*pair), ssim(*pair), network(*pair)))
+            scores.append((psnr(*pair), ssim(*pair), float(network(*pair))))
             if len(scores) <= 3:
                 both = torch.cat([image, target]) * 255
                 strip.append(

@@ -5,7 +5,6 @@
     guidance/reference.png             the person, whole, on a plain ground
     guidance/reference_pose.png        its skeleton
     guidance/poses/000000.png ...      the turn's skeletons
-    guidance/pose.mp4                  the same as a video
     guidance/poses.parquet, cameras.parquet, keypoints.parquet    our records of the turn
     guidance/guidance.json             sizes, frame rate, and why this reference frame
     guidance/peers/                    the same poses and cameras as the peers' tools read them
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import write_poses
-from pipeline.frames import frame_path, write_png, write_video
+from pipeline.frames import frame_path, write_png
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.records import write_cameras, write_json
@@ -51,13 +50,10 @@ def write_guidance(
     size = (turn.camera.width, turn.camera.height)
     write_png(folder / "reference.png", reference.image)
     write_png(folder / "reference_pose.png", draw_skeleton(reference.keypoints, *size))
-    skeletons = []
     with context.progress(len(keypoints), "guidance") as progress:
         for row, points in enumerate(keypoints):
-            skeletons.append(frame_path(folder / "poses", row))
-            write_png(skeletons[-1], draw_skeleton(points, *size))
+            write_png(frame_path(folder / "poses", row), draw_skeleton(points, *size))
             progress.advance()
-    write_video(folder / "pose.mp4", (draw_skeleton(points, *size) for points in keypoints), settings.fps)
     _write_records(folder, clip, turn, keypoints, context.body_file)
     write_json(
         folder / "guidance.json",

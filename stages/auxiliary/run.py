@@ -46,7 +46,7 @@ def run(context: Context) -> None:
     landmarks, settings = load_landmarks(clip.body, context.body), context.settings
     turn, surface = make_turn(clip, settings), texture.fine_surface(clip.body, settings.texture_levels)
     seen = texture.gather(clip, surface, spread(clip.train, settings.texture_frames), context)
-    colors, framing = texture.complete(surface, seen), find_framing(clip)
+    colors, framing = texture.complete(surface, seen, settings.texture_light), find_framing(clip)
     context.log(f"the clip shows {seen.known.mean():.0%} of the surface")
     if generator != "texture" or settings.texture_guidance:
         reference = make_reference(clip, turn, landmarks, framing, surface, colors)

@@ -31,6 +31,7 @@ class AuxiliarySettings:
     # texture
     texture_frames: int = 24  # of the clip, whose colours are projected
     texture_levels: int = 2  # of subdivision of the mesh that carries the texture
+    texture_light: bool = True  # shade the unseen side as the seen one says that light falls
     texture_guidance: bool = True  # write the guidance too
 
     # mimicmotion

@@ -24,6 +24,7 @@ from stages.train.poses import PoseRefinement
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
 BELIEVED = 0.5  # trust from which a pixel has a say in first colours
+THROUGH = 0.1  # of the weight in generated frames, under which what captured frames show is not the surface
 SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
 
 
@@ -88,7 +89,8 @@ def first_colors(
     total, weight = _shown(avatar, poses, views, chosen, band)
     if made:
         total_made, weight_made = _shown(avatar, poses, views, made, band)
-        unseen = weight == 0
+        # A little of what lies behind shines through: a back has weight in a front view, and its colours.
+        unseen = weight / len(chosen) < THROUGH * weight_made / len(made)
         total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
     neighbours = avatar.surfaces[-1].neighbours
     return torch.logit(fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
@@ -111,6 +113,8 @@ def _shown(
         color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
         # All or nothing: a mean does not feel a small weight that all of its members share.
         believed = trust(view.alpha, band) >= BELIEVED
+        if view.trust is not None:
+            believed &= view.trust >= BELIEVED
         person = (believed & (view.alpha > 0.5)).float()[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]

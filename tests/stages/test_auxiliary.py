@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import joint_index, read_poses, rest_joints
+from pipeline.body import joint_index, read_poses, rest_joints, vertex_normals
 from pipeline.camera import project
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_video
@@ -27,6 +27,7 @@ from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turn_keypoints
 from stages.auxiliary.texture.complete import membrane, neighbours
 from stages.auxiliary.texture.project import Seen, robust_mean, weighted_median
+from stages.auxiliary.texture.shade import shading
 from stages.auxiliary.turn import ID_OFFSET, make_turn
 from tests.plans import plan_of
 from tests.stages.auxiliary_subject import BODY_FILE, body_and_landmarks, context_for, read, write_clip
@@ -152,11 +153,28 @@ def test_the_unseen_side_is_the_mirror_of_the_seen_one():
     points = body.v_template.numpy()
     pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
     known = points[:, 0] > 0
-    seen = Seen(np.where(known[:, None], pattern, 0).astype(np.float32), known.astype(np.float32), known)
+    color, weight = np.where(known[:, None], pattern, 0).astype(np.float32), known.astype(np.float32)
+    seen = Seen(color, weight, known, np.zeros_like(points))
     found = texture.complete(surface, seen)
     right = points[:, 0] < -0.02
     error = np.abs(found - pattern)[right]
     assert np.median(error) < 5 and error.mean() < 12
+
+
+def test_an_unseen_back_is_shaded_as_the_light_says():
+    """White seen from the front under a lamp in front: the slope is found, and the back is not as bright."""
+    surface = texture.fine_surface(body_and_landmarks()[0], 0)
+    normal = vertex_normals(body_and_landmarks()[0].v_template, surface.faces).numpy()
+    known = normal[:, 2] > 0.1
+    color = (150 * np.exp(0.4 * normal[:, 2:3]) * np.ones((1, 3))).astype(np.float32)
+    weight = known.astype(np.float32)
+    shade = shading(color, weight, normal, surface.part)
+    assert shade[known].max() - shade[known].min() == pytest.approx(0.34, abs=0.04)
+    back = normal[:, 2] < -0.5
+    assert shade[back] == pytest.approx(shade[known].min(), abs=0.02)
+    seen = Seen(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
+    assert np.median(texture.complete(surface, seen)[back]) < 165
+    assert not shading(color, np.zeros(len(color)), normal, surface.part).any()
 
 
 def test_projected_colours_are_those_of_the_frames(full):

@@ -15,20 +15,27 @@ import torch
 from scipy.sparse.linalg import cg, splu
 
 from stages.auxiliary.texture.project import Seen
+from stages.auxiliary.texture.shade import shading
 from stages.auxiliary.texture.surface import FineSurface
 
 _TOLERANCE, _ITERATIONS = 1e-3, 300
 _PULL = 1e-7  # towards the mean, so that a part without any known neighbour has an answer
 
 
-def complete(surface: FineSurface, seen: Seen) -> np.ndarray:
+def complete(surface: FineSurface, seen: Seen, light: bool = True) -> np.ndarray:
     """A colour for every vertex: [N, 3] float32 in 0 to 255.
 
-    Nothing spreads from the face or the neck to the scalp, where only hair that was seen is a guide.
+    With ``light`` it is colours without their shading that spread, and each vertex is shaded as its
+    normal says (``shade.py``). Nothing spreads from the face or the neck to the scalp, where only hair
+    that was seen is a guide.
     """
     if not seen.known.any():
         return np.full((len(surface), 3), 128, np.float32)
-    color, known = seen.color.copy(), seen.known.copy()
+    known = seen.known.copy()
+    shade = np.ones((len(surface), 1))
+    if light:
+        shade = np.exp(shading(seen.color, seen.weight * known, seen.normal, surface.part))[:, None]
+    color = seen.color / shade
     adjacency = neighbours(surface.edges(), len(surface))
     mirror = surface.mirrored
     copied = ~known & known[mirror]
@@ -42,7 +49,7 @@ def complete(surface: FineSurface, seen: Seen) -> np.ndarray:
     body = int(surface.coarse.max()) + 1
     rough = membrane(neighbours(surface.edges(coarse=True), body), color[:body], known[:body], mean)
     start = surface.refine(torch.from_numpy(rough)).numpy()
-    return np.clip(membrane(adjacency, color, known, mean, start), 0, 255).astype(np.float32)
+    return np.clip(shade * membrane(adjacency, color, known, mean, start), 0, 255).astype(np.float32)
 
 
 def neighbours(edges: np.ndarray, count: int) -> sparse.csr_matrix:

@@ -40,26 +40,30 @@ class Seen:
         color: [N, 3] float32, RGB in 0 to 255; meaningless where ``weight`` is 0.
         weight: [N] float32, summed over the frames.
         known: [N] bool, whether the colour can be trusted.
+        normal: [N, 3] float32, mean normals in the world over the frames, of all vertices.
     """
 
     color: np.ndarray
     weight: np.ndarray
     known: np.ndarray
+    normal: np.ndarray
 
 
 def gather(clip: Clip, surface: FineSurface, frames: Sequence[int], context: Context) -> Seen:
     """Colours of all vertices from some frames of the clip."""
     colors = np.zeros((len(frames), len(surface), 3), np.uint8)
     weights = np.zeros((len(frames), len(surface)), np.float32)
+    normal = np.zeros((len(surface), 3), np.float32)
     with context.progress(len(frames), "texture") as progress:
         for row, frame in enumerate(frames):
             colors[row], weights[row] = look(clip, surface, frame)
+            normal += surface.refine(vertex_normals(clip.vertices(frame), clip.body.faces)).numpy()
             progress.advance()
     largest = weights.max()
     weights /= max(float(largest), 1e-12)
     color = robust_mean(colors, weights)
     weight = weights.sum(0)
-    return Seen(color, weight, weight > SURE)
+    return Seen(color, weight, weight > SURE, normal / np.float32(max(1, len(frames))))
 
 
 def look(clip: Clip, surface: FineSurface, frame: int) -> tuple[np.ndarray, np.ndarray]:

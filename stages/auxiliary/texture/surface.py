@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipeline.body import BodyModel, is_face, joint_index
+from pipeline.body import PARTS, BodyModel, is_face, joint_index, part_labels
 from pipeline.body.mesh import edges_of_faces
 from pipeline.body.subdivision import subdivide
 
@@ -31,6 +31,7 @@ class FineSurface:
         ends: for each level the two vertices whose middle each new vertex is, [E, 2] int64.
         mirrored: [N] int64, the vertex that is nearest to each one's mirror image on the template.
         region: [N] int8, 1 on face and ears, 2 on the rest of the skull, else 0.
+        part: [N] int64, index into ``pipeline.body.parts.PARTS``.
     """
 
     faces: Tensor
@@ -38,6 +39,7 @@ class FineSurface:
     ends: tuple[Tensor, ...]
     mirrored: np.ndarray
     region: np.ndarray
+    part: np.ndarray
 
     def __len__(self) -> int:
         return len(self.mirrored)
@@ -60,10 +62,18 @@ def fine_surface(body: BodyModel, levels: int) -> FineSurface:
     for _ in range(levels):
         ends.append(edges_of_faces(faces)[0])
         faces = subdivide(faces, torch.zeros(int(faces.max()) + 1, 1))[0]
-    bare = FineSurface(faces, body.faces, tuple(ends), np.zeros(0, np.int64), np.zeros(0, np.int8))
+    none = np.zeros(0, np.int64)
+    bare = FineSurface(faces, body.faces, tuple(ends), none, none, none)
     template = bare.refine(body.v_template).numpy()
     mirrored = cKDTree(template).query(template * [-1, 1, 1])[1]
-    return dataclasses.replace(bare, mirrored=mirrored.astype(np.int64), region=_regions(body, bare))
+    return dataclasses.replace(
+        bare, mirrored=mirrored.astype(np.int64), region=_regions(body, bare), part=_parts(body, bare)
+    )
+
+
+def _parts(body: BodyModel, surface: FineSurface) -> np.ndarray:
+    marks = torch.nn.functional.one_hot(part_labels(body).long(), len(PARTS)).float()
+    return surface.refine(marks).argmax(1).numpy()
 
 
 def _regions(body: BodyModel, surface: FineSurface) -> np.ndarray:
