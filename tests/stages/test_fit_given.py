@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from stages.fit.pose_files import write_peer_files
 
 from pipeline.body import mean_identity, pose_body, read_identity, read_poses
 from pipeline.camera import Camera
@@ -20,7 +21,6 @@ from pipeline.pose_files import (
     write_record,
 )
 from pipeline.stage import Context
-from stages.fit.pose_files import write_peer_files
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest

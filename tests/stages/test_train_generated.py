@@ -65,7 +65,8 @@ def objective_of(subject, output, **changes):
     inputs = stage.read_inputs(context)
     refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
     avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
-    return stage.Trainer(avatar, refinement, inputs.evidence(texture), context.settings, None, None).objective
+    evidence = inputs.evidence(texture, context.settings)
+    return stage.Trainer(avatar, refinement, evidence, context.settings, None, None).objective
 
 
 def test_frames_have_their_own_size_camera_and_trust(subject, tmp_path):
