@@ -52,7 +52,7 @@ def scene(subject, output, **changes) -> Scene:
     context = context_for(subject, output, **{**ALL_ON, **changes})
     inputs = stage.read_inputs(context)
     refinement = PoseRefinement(inputs.poses, inputs.split.train)
-    avatar, _, texture = stage.prepare(inputs, refinement, context.settings, context)
+    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
     avatar.pose_heads_active = avatar.residuals_active = True
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():
