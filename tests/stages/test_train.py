@@ -26,7 +26,10 @@ from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
 READERS = ((read_frame, "frames"), (read_mask, "masks"))
 RED = np.array([255, 0, 0], np.uint8)
-PUBLISHED = {"avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet"}
+PUBLISHED = {
+    "avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet",
+    "visibility.png",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
