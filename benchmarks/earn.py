@@ -42,6 +42,7 @@ BASE = {
     "train.subdivisions": "0",
     "train.lpips": "0.05",
     "train.face": "0.8",
+    "auxiliary.generator": "off",
     "train.held_out_frames": "0",
 }
 """The quick preset with every term of the paper's objective, small, without subdivision."""
