@@ -36,7 +36,12 @@ from pipeline.study import made
 SUBJECTS = ("mannequin_upper", "mannequin_head")
 BLEED, WOBBLE, SOFT = 2.5, 2.0, 1.5  # pixels: outwards, standard deviation of the edge, width of the edge
 BAND = 6  # pixels on either side of the silhouette that the outline is judged in
-BASE = {"train.iterations": "200", "train.held_out_frames": "0", "train.subdivisions": "0"}
+BASE = {
+    "train.iterations": "200",
+    "train.held_out_frames": "0",
+    "train.subdivisions": "0",
+    "auxiliary.generator": "off",
+}
 TRUE, SOFT_MASK = "true masks", "soft alpha"
 WAYS: Mapping[str, Mapping[str, str]] = {
     TRUE: {},
