@@ -46,7 +46,7 @@ class Evidence:
 
     @property
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The captured and the generated frames: equally often drawn, however many of each there are."""
+        """The captured and the generated frames, drawn as ``train.generated_every`` says."""
         made = self.views.generated
         return (
             tuple(frame for frame in self.frames if frame not in made),
@@ -136,7 +136,7 @@ class Objective:
     def draw(self, position: int) -> Draw:
         """Everything random about the ``position``-th drawn frame of the run."""
         settings, seed = self.settings, self.settings.seed
-        frame = schedule.drawn_of_two(seed, self.evidence.sources, position)
+        frame = schedule.drawn_of_two(seed, *self.evidence.sources, settings.generated_every, position)
         timeless = schedule.drawn_share(seed, schedule.TIME, position) < settings.time_dropout
         length = 6 * (self.poses.poses.rotation.shape[1] - 1)
         return Draw(

@@ -42,17 +42,27 @@ def drawn_frame(seed: int, frames: tuple[int, ...], position: int) -> int:
     return frames[_order(seed, len(frames), epoch)[place]]
 
 
-def drawn_of_two(seed: int, sources: tuple[tuple[int, ...], tuple[int, ...]], position: int) -> int:
-    """The frame of the ``position``-th draw from two sources that are drawn equally often.
+def drawn_of_two(
+    seed: int, captured: tuple[int, ...], generated: tuple[int, ...], every: int, position: int
+) -> int:
+    """The frame of the ``position``-th draw from two sources.
 
-    Every two draws hold one of each, in random order; within a source as ``drawn_frame``. An empty
-    source leaves all draws to the other.
+    Every ``every`` draws hold one generated frame, at a random place among them; within a source as
+    ``drawn_frame``. An empty source leaves all draws to the other.
+
+    Args:
+        seed: of the run.
+        captured, generated: frame numbers.
+        every: 2 draws from both equally often, as in the paper (Section 3.6).
+        position: which draw of the run.
     """
-    if not all(sources):
-        return drawn_frame(seed, sources[0] or sources[1], position)
-    pair, second = divmod(position, 2)
-    swapped = drawn_share(seed, SOURCE, pair) < 0.5
-    return drawn_frame(seed, sources[second ^ swapped], pair)
+    if not captured or not generated:
+        return drawn_frame(seed, captured or generated, position)
+    block, place = divmod(position, every)
+    chosen = int(every * drawn_share(seed, SOURCE, block))
+    if place == chosen:
+        return drawn_frame(seed, generated, block)
+    return drawn_frame(seed, captured, block * (every - 1) + place - (place > chosen))
 
 
 @functools.lru_cache(maxsize=4)

@@ -114,6 +114,7 @@ class TrainSettings:
     lpips_crop: int = 96  # pixels of the square around a random place of the person; 0: the whole view
     lpips_from: float = 0.0  # fraction of the run from which it takes part
     face: float = 0.0  # lambda_face; the paper's is 0.8
+    generated_every: int = 5  # draws for one of a generated frame; the paper's is 2, equally often
     generated: float = 0.1  # lambda_L1, lambda_ssim and lambda_lpips on generated frames
     mask_band: int = 0  # pixels on either side of the silhouette where the mask is in doubt; 0: believed
     mask_refine: bool = False  # in that band take the avatar's own alpha for the mask, not nothing

@@ -79,9 +79,9 @@ def test_frames_have_their_own_size_camera_and_trust(subject, tmp_path):
     assert inputs.views.camera(FIRST).width == 36
 
 
-def test_draws_are_equal_and_poses_of_generated_frames_never_move(objective):
+def test_poses_of_generated_frames_never_move(objective):
     drawn = [objective.draw(position).frame for position in range(20)]
-    assert sum(frame >= FIRST for frame in drawn) == 10
+    assert sum(frame >= FIRST for frame in drawn) == 4  # one in five
     assert str(FIRST) not in objective.poses.rotation and "0" in objective.poses.rotation
     position = next(k for k, frame in enumerate(drawn) if frame >= FIRST)
     terms = objective(position, 0, True)

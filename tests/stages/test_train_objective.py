@@ -168,13 +168,15 @@ def test_generated_frames_weigh_less_and_have_no_face(objective):
     assert float(copied["laplacian_offset"]) == float(real["laplacian_offset"])
 
 
-def test_captured_and_generated_frames_are_drawn_equally_often(objective):
-    made = objective(generated=(2,))
-    frames = [made.draw(position).frame for position in range(80)]
-    assert all((frames[place] == 2) != (frames[place + 1] == 2) for place in range(0, 80, 2))
-    assert 5 < sum(frame == 2 for frame in frames[::2]) < 35  # in no fixed order
+@pytest.mark.parametrize("every", [2, 5])
+def test_one_draw_in_so_many_is_of_a_generated_frame(objective, every):
+    made = objective(generated=(2,), generated_every=every)
+    frames = [made.draw(position).frame for position in range(40 * every)]
+    blocks = [frames[start : start + every] for start in range(0, len(frames), every)]
+    assert all(block.count(2) == 1 for block in blocks)
+    assert 1 < sum(block[0] == 2 for block in blocks) < 39  # in no fixed order
     captured = [frame for frame in frames if frame != 2]
-    assert all(captured.count(frame) == 10 for frame in (0, 1, 3, 4))
+    assert all(captured.count(frame) == 10 * (every - 1) for frame in (0, 1, 3, 4))
 
 
 def test_mask_in_doubt_lowers_what_the_silhouette_costs(objective):
