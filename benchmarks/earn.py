@@ -38,7 +38,7 @@ CROP_HEIGHT = 160  # pixels of a picture of face or hand
 
 BASE = {
     "ingest.long_side": "320",
-    "train.iterations": "200",
+    "train.iterations": "120",
     "train.subdivisions": "0",
     "train.lpips": "0.05",
     "train.face": "0.8",
