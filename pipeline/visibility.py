@@ -74,7 +74,7 @@ class Line:
 def in_frame(camera: Camera, points: Tensor) -> Tensor:
     """Which points lie inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
     pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
-    size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype)
+    size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype, device=pixels.device)
     return (depth > NEAR) & ((pixels >= 0) & (pixels < size)).all(1)
 
 

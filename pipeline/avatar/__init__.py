@@ -1,9 +1,10 @@
 """The avatar: a canonical triplane that is decoded to Gaussians and posed with the body."""
 
 from pipeline.avatar.architecture import Architecture
-from pipeline.avatar.avatar import Avatar, Decoded, Posed, Surface, pose_features
+from pipeline.avatar.avatar import Avatar, Decoded, Posed, pose_features
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.storage import load_avatar, save_avatar
+from pipeline.avatar.surface import Surface
 
 __all__ = [
     "Architecture",

@@ -15,48 +15,21 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.architecture import Architecture
-from pipeline.avatar.canonical import HANDS, HEAD, Canonical, build_canonical
+from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
-from pipeline.avatar.residual import Region, Residuals, regions
+from pipeline.avatar.residual import Residuals, regions
 from pipeline.avatar.restrict import active_rows, restricted
 from pipeline.avatar.rows import put, take
 from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
-from pipeline.avatar.sparse import SparsePair
-from pipeline.avatar.triplane import Triplane, normalise, region_boxes, sampling
+from pipeline.avatar.surface import Surface, build_surface, plane_regions
+from pipeline.avatar.triplane import Triplane
 from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms
+from pipeline.device import autocast, moved
 from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
 LARGEST_SCALE = 0.03  # metres
-
-
-@dataclasses.dataclass(frozen=True)
-class Surface:
-    """One level of subdivision: the canonical mesh and the constants that go with it.
-
-    Attributes:
-        canonical: the mesh.
-        samples: from texels to the vertices' features.
-        neighbours: the mean over each vertex's neighbours.
-        pliable: [N, 1] float, 1 where pose heads may move a vertex: not on head and hands, which
-            follow the body model alone.
-        rig: the mesh as skinning without gradient needs it.
-        residual: the parts that have a residual colour head.
-        rows: [N] int64, which of the level's vertices these are; None where they are all of them.
-    """
-
-    canonical: Canonical
-    samples: SparsePair
-    neighbours: SparsePair
-    pliable: Tensor  # [N, 1]
-    rig: Rig
-    residual: tuple[Region, ...] = ()
-    rows: Tensor | None = None
-
-    def pick(self, values: Tensor) -> Tensor:
-        """The rows of this surface in what is known of every vertex of the finest level: [M, C] -> [N, C]."""
-        return values[: len(self.canonical)] if self.rows is None else values[self.rows]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +78,8 @@ class Avatar(nn.Module):
 
     Attributes:
         architecture: sizes.
-        kept: [K] int64, the body vertices that carry Gaussians.
-        identity: the fitted identity.
+        kept: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
+        identity: the fitted identity; on the CPU, too.
         body_digest: of the body model that it was built on.
         surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
         active: [K] bool, the kept vertices that the visibility gate leaves; see ``surface``.
@@ -147,10 +120,10 @@ class Avatar(nn.Module):
         meshes = [
             build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
         ]
-        planes, self.boxes = _regions(meshes[-1])
+        planes, self.boxes = plane_regions(meshes[-1])
         residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
         self.surfaces = [
-            _surface(mesh, planes[: len(mesh)], self.boxes, architecture.plane_resolution, parts)
+            build_surface(mesh, planes[: len(mesh)], self.boxes, architecture.plane_resolution, parts)
             for mesh, parts in zip(meshes, residual, strict=True)
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
@@ -189,6 +162,21 @@ class Avatar(nn.Module):
         """The number of Gaussians."""
         return len(self.surface().canonical)
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights and surfaces are."""
+        return self.active.device
+
+    def to(self, device: torch.device | str) -> Avatar:  # type: ignore[override]
+        """Moves weights and surfaces; what they are of is not for changing."""
+        if torch.device(device) == self.device:
+            return self
+        super().to(device)
+        self._own_surfaces = moved(self._own_surfaces, device)
+        self.boxes = self.boxes.to(device)
+        self.apply_skin()
+        return self
+
     def gate(self, active: Tensor) -> None:
         """Leaves only some of the kept vertices; others may come back with a later call.
 
@@ -216,7 +204,8 @@ class Avatar(nn.Module):
         points = decoded.surface.canonical.vertices + decoded.offset
         free = decoded.surface.pliable[:, 0] > 0
         rows = nearest_rows(points, self.surfaces[0].canonical.vertices, free)
-        self.skin_rows.index_copy_(0, decoded.surface.pick(torch.arange(len(self.skin_rows))), rows)
+        places = decoded.surface.pick(torch.arange(len(self.skin_rows), device=self.device))
+        self.skin_rows.index_copy_(0, places, rows)
         self.apply_skin()
 
     def apply_skin(self) -> None:
@@ -234,7 +223,7 @@ class Avatar(nn.Module):
         return super().train(mode)
 
     def _autocast(self) -> torch.autocast:
-        return torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision)
+        return autocast(self.device, self.half_precision)
 
     def decode(self, level: int = -1) -> Decoded:
         """The pose-independent part, on one level of subdivision (the finest by default)."""
@@ -295,7 +284,7 @@ class Avatar(nn.Module):
             quaternions=decoded.surface.rig.place(transforms, shape, transl)[1],
             scales=self._scales(canonical, log_scale),
             colors=torch.sigmoid(color_logit),
-            opacities=torch.full((len(canonical),), self.architecture.opacity),
+            opacities=self._opacities(canonical),
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
 
@@ -314,6 +303,9 @@ class Avatar(nn.Module):
             geometry, color = put(geometry, rows, count), put(color, rows, count)
         offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
         return offset, 0.5 * geometry[:, 3:], color
+
+    def _opacities(self, canonical: Canonical) -> Tensor:
+        return torch.full((len(canonical),), self.architecture.opacity, device=self.device)
 
     def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
         across = canonical.spacing * self.architecture.scale
@@ -360,9 +352,9 @@ class Avatar(nn.Module):
         return Gaussians(
             means=_transform(blend_transforms(transforms, canonical.skinning_weights), shape) + transl,
             quaternions=surface.rig.place(transforms, shape, transl)[1],
-            scales=self._scales(canonical, torch.zeros(len(canonical), 3)),
+            scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
             colors=torch.sigmoid(surface.pick(self.base_color)),
-            opacities=torch.full((len(canonical),), self.architecture.opacity),
+            opacities=self._opacities(canonical),
         )
 
     def _unseen_surface(self) -> Surface:
@@ -370,7 +362,7 @@ class Avatar(nn.Module):
         known = self._restricted.get(-1)
         if known is None or not torch.equal(known[0], self.active):
             left = self.surface().rows
-            rest = torch.ones(len(self.surfaces[-1].canonical), dtype=torch.bool)
+            rest = torch.ones(len(self.surfaces[-1].canonical), dtype=torch.bool, device=self.device)
             rest[left] = False
             rows = torch.nonzero(rest)[:, 0]
             known = self._restricted[-1] = self.active.clone(), restricted(self.surfaces[-1], rows)
@@ -384,27 +376,7 @@ def pose_features(rotation: Tensor) -> Tensor:
     zero: [55, 3] rotation vectors -> [54 * 6].
     """
     matrices = roma.rotvec_to_rotmat(rotation[1:])
-    return (matrices - torch.eye(3))[:, :, :2].reshape(-1)
-
-
-def _regions(finest: Canonical) -> tuple[Tensor, Tensor]:
-    """The triplane regions of the finest level's vertices, [N], and their boxes, [R, 2, 3].
-
-    Head and rest of the body, or a single region when only one of them is kept.
-    """
-    head = finest.is_part(*HEAD)
-    both = bool(head.any()) and not bool(head.all())
-    planes = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
-    return planes, region_boxes(finest.vertices, planes)
-
-
-def _surface(
-    mesh: Canonical, planes: Tensor, boxes: Tensor, resolution: int, residual: tuple[Region, ...]
-) -> Surface:
-    coordinates = normalise(mesh.vertices, planes, boxes)
-    samples = sampling(coordinates, planes, len(boxes), resolution)
-    pliable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
-    return Surface(mesh, samples, mesh.neighbour_mean(), pliable, Rig.build(mesh), residual)
+    return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
 
 
 def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> Tensor:
@@ -412,7 +384,7 @@ def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> T
     shape = canonical.vertices + canonical.expression_directions[..., : len(expression)] @ expression
     if canonical.pose_directions is None:
         return shape
-    matrices = roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)
+    matrices = roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3, device=rotation.device)
     return shape + canonical.pose_directions @ matrices.reshape(-1)
 
 

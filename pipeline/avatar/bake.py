@@ -179,7 +179,7 @@ class BakedAvatar:
 
 @torch.no_grad()
 def bake(avatar: Avatar) -> BakedAvatar:
-    """Computes the pose-independent part of a finished avatar; the avatar is left as it is.
+    """Computes the pose-independent part of a finished avatar on the CPU; the avatar is left as it is.
 
     What the visibility gate took is not in it, whatever ``Avatar.unseen`` says.
     """

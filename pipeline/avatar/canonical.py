@@ -67,7 +67,9 @@ class Canonical:
 
     def is_part(self, *names: str) -> Tensor:
         """[N] bool: the vertices of the named parts."""
-        wanted = torch.tensor([PARTS.index(name) for name in names])
+        wanted = torch.tensor(
+            [PARTS.index(name) for name in names], dtype=torch.long, device=self.parts.device
+        )
         return torch.isin(self.parts, wanted)
 
     def neighbour_mean(self) -> SparsePair:
@@ -169,7 +171,7 @@ def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
 
 def faces_among(faces: Tensor, kept: Tensor, count: int) -> Tensor:
     """The triangles whose three corners are kept, in the numbers that these then have: [F, 3] -> [G, 3]."""
-    new_index = torch.full((count,), -1, dtype=torch.long)
-    new_index[kept] = torch.arange(len(kept))
+    new_index = torch.full((count,), -1, dtype=torch.long, device=faces.device)
+    new_index[kept] = torch.arange(len(kept), device=faces.device)
     inside = (new_index[faces] >= 0).all(1)
     return new_index[faces[inside]]

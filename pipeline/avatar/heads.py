@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from pipeline.avatar.fused import Layers, decode
 from pipeline.avatar.fused_kernels import EPSILON
+from pipeline.device import autocast, kernels_serve
 
 
 class GroupNormReLU(nn.Module):
@@ -28,6 +29,7 @@ class GroupNormReLU(nn.Module):
         """Normalises each group of channels of each row, then clips: [N, C] -> [N, C]."""
         grouped = x.view(len(x), self.groups, -1)
         normal = functional.layer_norm(grouped, grouped.shape[2:], eps=EPSILON).view(x.shape)
+        normal = normal.to(x.dtype)  # autocast on a GPU norms in float32
         return functional.relu(torch.addcmul(self.bias.to(x.dtype), normal, self.weight.to(x.dtype)))
 
 
@@ -67,12 +69,10 @@ class Head(nn.Module):
         if self.condition is not None and condition is None:
             raise ValueError("this head is conditioned on a vector, and none was given")
         kind = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
-        if points.device.type == "cpu" and kind in (torch.float32, torch.bfloat16):
+        if kernels_serve(points) and kind in (torch.float32, torch.bfloat16):
             return decode(points, self._layers(condition), kind)
-        x = self.first(points)
-        if self.condition is not None and condition is not None:
-            x = x + self.condition(condition[None]).to(x.dtype)
-        x = self.norms[0](x)
+        layers = self._layers(condition)
+        x = self.norms[0](functional.linear(points, layers.weights[0], layers.biases[0]))
         x = self.norms[1](self.hidden[0](x))
         x = self.norms[2](self.hidden[1](x))
         return self.last(x)
@@ -82,6 +82,6 @@ class Head(nn.Module):
         layers = Layers.of([self.first, *self.hidden, self.last], list(self.norms))
         if self.condition is None or condition is None:
             return layers
-        with torch.autocast("cpu", enabled=False):  # one small product: exact for nothing
+        with autocast(condition.device, enabled=False):  # one small product: exact for nothing
             first = layers.biases[0] + self.condition(condition)
         return dataclasses.replace(layers, biases=(first, *layers.biases[1:]))

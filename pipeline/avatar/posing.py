@@ -1,7 +1,8 @@
-"""Posing Gaussians on a CPU, without gradient: skinning, normals and what a head's output becomes.
+"""Posing Gaussians without gradient: skinning, normals and what a head's output becomes.
 
-The same as ``Avatar.pose`` computes in torch, each in one pass over the Gaussians. A point hangs on a
-few of the 55 joints only; the others' weights are zero and are left out here.
+The same as ``Avatar.pose`` computes in torch, on a CPU each in one pass over the Gaussians. A point hangs on
+a few of the 55 joints only; the others' weights are zero and are left out here. ``plain_normals`` and
+``plain_place`` say what the kernels mean, and are what runs on any other device.
 """
 
 from __future__ import annotations
@@ -10,12 +11,15 @@ import dataclasses
 
 import numba
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
 from pipeline.avatar.fused import use_torch_threads
 from pipeline.avatar.fused_kernels import CHUNKS, FAST
+from pipeline.body import vertex_normals
+from pipeline.device import kernels_serve
 
 
 def joints_of_points(skinning_weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -32,7 +36,7 @@ def faces_of_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """The faces around each vertex: [F, 3] -> starts [count + 1] and face numbers [3 F], both int32."""
     corners = faces.flatten()
     order = corners.argsort(stable=True)
-    starts = torch.zeros(count + 1, dtype=torch.int32)
+    starts = torch.zeros(count + 1, dtype=torch.int32, device=faces.device)
     starts[1:] = torch.bincount(corners, minlength=count).cumsum(0)
     return starts, (order // 3).int()
 
@@ -73,6 +77,8 @@ class Rig:
         Returns:
             [N, 3].
         """
+        if not kernels_serve(points):
+            return plain_normals(self, transforms, points)
         use_torch_threads()
         posed, normals = torch.empty_like(points), torch.empty_like(points)
         skin_points(*self._skinned(transforms, points), posed.numpy())
@@ -87,6 +93,8 @@ class Rig:
             transforms, points: as for ``normals``.
             transl: [3] float32, metres.
         """
+        if not kernels_serve(points):
+            return plain_place(self, transforms, points, transl)
         use_torch_threads()
         means, quaternions = torch.empty_like(points), points.new_empty(len(points), 4)
         skinned, frames = self._skinned(transforms, points), self.frames.numpy()
@@ -98,6 +106,34 @@ class Rig:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         flat, rest = transforms.detach().flatten(1).contiguous(), points.detach().contiguous()
         return flat.numpy(), self.joints_of.numpy(), self.weights.numpy(), rest.numpy()
+
+
+@torch.no_grad()
+def plain_normals(rig: Rig, transforms: Tensor, points: Tensor) -> Tensor:
+    """What ``Rig.normals`` computes, in plain torch."""
+    blended = _blended(rig, transforms)
+    return vertex_normals(_carried(blended, points), rig.faces.long())
+
+
+@torch.no_grad()
+def plain_place(rig: Rig, transforms: Tensor, points: Tensor, transl: Tensor) -> tuple[Tensor, Tensor]:
+    """What ``Rig.place`` computes, in plain torch."""
+    blended = _blended(rig, transforms)
+    quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ rig.frames)
+    return _carried(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
+
+
+def _blended(rig: Rig, transforms: Tensor) -> Tensor:
+    """The transform that each point is carried with, [N, 3, 4]."""
+    flat, total = transforms.flatten(1), transforms.new_zeros(len(rig.weights), 12)
+    # One joint after the other: [N, K, 12] is large.
+    for weight, joint in zip(rig.weights.unbind(1), rig.joints_of.long().unbind(1), strict=True):
+        total += weight[:, None] * flat[joint]
+    return total.unflatten(1, (3, 4))
+
+
+def _carried(blended: Tensor, points: Tensor) -> Tensor:
+    return (blended[..., :3] * points[:, None]).sum(-1) + blended[..., 3]
 
 
 @numba.njit(fastmath=FAST, inline="always")

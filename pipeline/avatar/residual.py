@@ -62,8 +62,7 @@ def part_rows(canonical: Canonical, parts: tuple[str, ...]) -> dict[str, Tensor]
     named = [part for part in parts if part != REST]
     chosen = {part: canonical.is_part(part) for part in named}
     if REST in parts:
-        taken = canonical.is_part(*named) if named else torch.zeros(len(canonical), dtype=torch.bool)
-        chosen[REST] = ~taken
+        chosen[REST] = ~canonical.is_part(*named)
     rows = {part: torch.nonzero(inside)[:, 0] for part, inside in chosen.items()}
     return {part: rows[part] for part in parts if len(rows[part])}
 
@@ -97,7 +96,8 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
     Returns:
         [..., D (1 + 2 L)].
     """
-    angles = values[..., None] * (math.pi * 2.0 ** torch.arange(frequencies, dtype=values.dtype))
+    octaves = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
+    angles = values[..., None] * (math.pi * octaves)
     waves = torch.cat([angles.sin(), angles.cos()], -1).flatten(-2)
     return torch.cat([values, waves], -1)
 
@@ -114,7 +114,7 @@ def time_code(time: float | None, time_range: Tensor, frequencies: int) -> Tenso
         frequencies: L.
     """
     if time is None:
-        return torch.zeros(1 + 2 * frequencies)
+        return torch.zeros(1 + 2 * frequencies, device=time_range.device)
     first, last = time_range.unbind()
     done = ((time - first) / (last - first).clamp_min(1e-6)).clamp(0, 1)
     return encode(done[None], frequencies)
@@ -184,10 +184,10 @@ class Residuals(nn.Module):
             asked: [M] int64, the Gaussians that matter, all if None; of the others it is zero, too.
         """
         if asked is not None:
-            wanted = torch.zeros(len(means), dtype=torch.bool).index_fill_(0, asked, True)
+            wanted = means.new_zeros(len(means), dtype=torch.bool).index_fill_(0, asked, True)
             places = tuple(_some(region, wanted) for region in places)
         condition = torch.cat([self.time_code(time), theta])
-        change = torch.zeros(len(means), 3)
+        change = torch.zeros(len(means), 3, device=means.device)
         for region in places:
             encoded = region.encoded
             if self.place == "posed":

@@ -7,7 +7,6 @@ Texels that only it would read are in no product any more, so that their gradien
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,10 +14,8 @@ from torch import Tensor
 from pipeline.avatar.canonical import Canonical, faces_among
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region
+from pipeline.avatar.surface import Surface
 from pipeline.body import subdivide
-
-if TYPE_CHECKING:
-    from pipeline.avatar.avatar import Surface
 
 
 def active_rows(coarse: Canonical, active: Tensor, level: int) -> Tensor:
@@ -47,8 +44,8 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
         rows: [M] int64, increasing.
     """
     canonical, count = surface.canonical, len(surface.canonical)
-    place = torch.full((count,), -1, dtype=torch.long)
-    place[rows] = torch.arange(len(rows))
+    place = torch.full((count,), -1, dtype=torch.long, device=rows.device)
+    place[rows] = torch.arange(len(rows), device=rows.device)
     chosen = {
         name: None if (values := getattr(canonical, name)) is None else values[rows]
         for name in (
@@ -57,7 +54,7 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
         )
     }  # fmt: skip
     mesh = dataclasses.replace(canonical, faces=faces_among(canonical.faces, rows, count), **chosen)
-    features = (3 * rows[:, None] + torch.arange(3)).flatten()  # a row a plane
+    features = (3 * rows[:, None] + torch.arange(3, device=rows.device)).flatten()  # a row a plane
     return dataclasses.replace(
         surface,
         canonical=mesh,

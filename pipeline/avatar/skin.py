@@ -29,9 +29,10 @@ def nearest_rows(points: Tensor, original: Tensor, free: Tensor) -> Tensor:
     Returns:
         [N] int64, rows of ``original``; ``OWN`` where a point may not.
     """
-    rows = torch.full((len(points),), OWN)
-    _, nearest = scipy.spatial.cKDTree(original.detach().numpy()).query(points[free].detach().numpy())
-    rows[free] = torch.from_numpy(nearest).long()
+    rows = torch.full((len(points),), OWN, device=points.device)
+    tree = scipy.spatial.cKDTree(original.detach().cpu().numpy())
+    _, nearest = tree.query(points[free].detach().cpu().numpy())
+    rows[free] = torch.from_numpy(nearest).long().to(points.device)
     return rows
 
 

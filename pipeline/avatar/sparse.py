@@ -15,6 +15,8 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from pipeline.device import moved
+
 
 @dataclasses.dataclass(frozen=True)
 class SparsePair:
@@ -38,12 +40,13 @@ class SparsePair:
             values: [E] floating point.
             shape: (M, K).
         """
-        entries = scipy.sparse.coo_array((values.numpy(), (rows.int().numpy(), columns.int().numpy())), shape)
-        return cls(_to_torch(entries.tocsr()), _to_torch(entries.T.tocsr()))
+        places = rows.int().cpu().numpy(), columns.int().cpu().numpy()
+        entries = scipy.sparse.coo_array((values.cpu().numpy(), places), shape)
+        return moved(cls(_to_torch(entries.tocsr()), _to_torch(entries.T.tocsr())), values.device)
 
     def of_rows(self, rows: Tensor) -> SparsePair:
         """Some of the rows, [R] int64 -> a pair of shape [R, K]."""
-        return SparsePair._of(_to_scipy(self.matrix)[rows.numpy()])
+        return self._like(_to_scipy(self.matrix)[rows.cpu().numpy()])
 
     def mean_among(self, members: Tensor) -> SparsePair:
         """A square matrix of means over neighbours, among some of its members alone.
@@ -56,17 +59,17 @@ class SparsePair:
         Returns:
             A pair of shape [R, R].
         """
-        chosen = members.numpy()
+        chosen = members.cpu().numpy()
         among = _to_scipy(self.matrix)[chosen][:, chosen]
         left = np.asarray(among.sum(1), np.float64).ravel()
         scaled = scipy.sparse.diags_array(1 / np.where(left > 0, left, 1)) @ among
         alone = scipy.sparse.diags_array((left == 0).astype(np.float64))
-        return SparsePair._of((scaled + alone).astype(np.float32).tocsr())
+        return self._like((scaled + alone).astype(np.float32).tocsr())
 
-    @classmethod
-    def _of(cls, matrix: scipy.sparse.csr_array) -> SparsePair:
+    def _like(self, matrix: scipy.sparse.csr_array) -> SparsePair:
+        """Another matrix, where this one is."""
         matrix.eliminate_zeros()
-        return cls(_to_torch(matrix), _to_torch(matrix.T.tocsr()))
+        return moved(SparsePair(_to_torch(matrix), _to_torch(matrix.T.tocsr())), self.matrix.device)
 
     def __matmul__(self, dense: Tensor) -> Tensor:
         """``matrix @ dense``, [K, C] -> [M, C]; the backward pass is ``transpose @ gradient``."""
@@ -74,6 +77,7 @@ class SparsePair:
 
 
 def _to_scipy(matrix: Tensor) -> scipy.sparse.csr_array:
+    matrix = matrix.cpu()
     parts = (matrix.values(), matrix.col_indices(), matrix.crow_indices())
     return scipy.sparse.csr_array(tuple(part.numpy() for part in parts), shape=tuple(matrix.shape))
 

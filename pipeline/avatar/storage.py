@@ -47,7 +47,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
-    save_file({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, path, metadata)
+    save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
 
 
 def load_avatar(path: Path, body: BodyModel) -> Avatar:

@@ -91,5 +91,5 @@ def _unusable(error: Exception) -> UserError:
     return UserError(
         f"rendering on CUDA needs gsplat 1.5.3, which cannot be used ({error}): "
         "pip install 'flexiavatar[gpu]'. It compiles on first use, with nvcc, a C++ compiler and ninja; "
-        f"{found}. Or render on the CPU"
+        f"{found}. Or stay on the CPU, train.device=cpu"
     )

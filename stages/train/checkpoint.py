@@ -68,7 +68,7 @@ def run_key(settings: dict, arrays: Iterable[Tensor]) -> str:
 
 
 def gather(modules: dict[str, nn.Module], optimizers: Iterable[torch.optim.Optimizer]) -> dict[str, Tensor]:
-    """The modules' parameters and buffers, and the optimisers' state of each parameter."""
+    """The modules' parameters and buffers, and the optimisers' state of each parameter; on the CPU."""
     tensors = {
         f"{prefix}.{name}": tensor
         for prefix, module in modules.items()
@@ -78,13 +78,13 @@ def gather(modules: dict[str, nn.Module], optimizers: Iterable[torch.optim.Optim
         for name, parameter in _named(modules):
             for field, value in optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{field}.{name}"] = value
-    return {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
 
 
 def restore(
     tensors: dict[str, Tensor], modules: dict[str, nn.Module], optimizers: Iterable[torch.optim.Optimizer]
 ) -> None:
-    """Puts back what ``gather`` took."""
+    """Puts back what ``gather`` took, wherever the modules are now."""
     for prefix, module in modules.items():
         own = {
             name.removeprefix(f"{prefix}."): tensor
@@ -105,7 +105,7 @@ def restore(
             field, _, name = rest.partition(".")
             parameter = parameters[name]
             # A copy: what safetensors returns lies in the mapped file, with any alignment.
-            owner[parameter].state[parameter][field] = tensor.clone()
+            owner[parameter].state[parameter][field] = tensor.to(parameter.device, copy=True)
 
 
 def _named(modules: dict[str, nn.Module]) -> list[tuple[str, nn.Parameter]]:

@@ -13,6 +13,7 @@ import torch
 from pipeline.avatar import Avatar
 from pipeline.avatar.heads import Head
 from pipeline.avatar.residual import encode, part_rows
+from pipeline.device import autocast
 from stages.train.obey import RESIDUALS
 from stages.train.settings import TrainSettings
 
@@ -71,11 +72,14 @@ def _joints(avatar: Avatar) -> int:
 
 def _timed(avatar: Avatar, head: Head, points: torch.Tensor, condition: int) -> float:
     """Seconds of the fastest forward and backward pass; the first one is not counted."""
-    spent = []
+    spent, device = [], avatar.device
+    head, points, shared = head.to(device), points.to(device), torch.zeros(condition, device=device)
     for _ in range(1 + REPEATS):
         start = time.perf_counter()
-        with torch.autocast("cpu", torch.bfloat16, enabled=avatar.half_precision):
-            result = head(points.requires_grad_(), torch.zeros(condition))
+        with autocast(device, avatar.half_precision):
+            result = head(points.requires_grad_(), shared)
         result.float().sum().backward()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
         spent.append(time.perf_counter() - start)
     return min(spent[1:])

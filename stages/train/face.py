@@ -56,8 +56,9 @@ def face_triangles(canonical: Canonical) -> Tensor:
 def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, texture: Tensor) -> Pasted:
     """What a camera sees of some triangles of a mesh.
 
-    Which triangle a pixel sees is found without gradient; the place on it is differentiable, so that
-    gradients are those of the texture sliding under the pixel. The outline's motion has none.
+    Which triangle a pixel sees is found without gradient, on the CPU wherever the mesh is; the place on it
+    is differentiable, so that gradients are those of the texture sliding under the pixel. The outline's
+    motion has none.
 
     Args:
         camera: the view.
@@ -67,7 +68,7 @@ def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, textu
         texture: [N, 3], each vertex's colour.
     """
     raster = rasterize(camera, vertices, faces)
-    triangle = torch.from_numpy(raster.face).long()
+    triangle = torch.from_numpy(raster.face).to(faces)
     shown = chosen & _facing(camera, vertices.detach(), faces)
     rows, columns = torch.nonzero((triangle >= 0) & shown[triangle.clamp_min(0)], as_tuple=True)
     corners = faces[triangle[rows, columns]]

@@ -73,7 +73,8 @@ class Gate(nn.Module):
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
         for name in ("hits", "looked"):
-            self.register_buffer(name, torch.zeros(2, len(avatar.kept), dtype=torch.long))
+            counts = torch.zeros(2, len(avatar.kept), dtype=torch.long, device=avatar.device)
+            self.register_buffer(name, counts)
         self.line: Line | None = None
         self._first = avatar.active.clone()  # what is trained while the gate stays open
 
@@ -101,7 +102,7 @@ class Gate(nn.Module):
             self.looked[source] += 1
             return
         count = len(self.avatar.kept)
-        rows = torch.arange(count) if surface.rows is None else surface.rows
+        rows = torch.arange(count, device=weights.device) if surface.rows is None else surface.rows
         drawn = rows < count  # the Gaussians at the body's own vertices, on whichever level
         self.hits[source, rows[drawn]] += weights[: len(rows)][drawn] > 0
         self.looked[source, rows[drawn]] += 1
@@ -118,7 +119,7 @@ class Gate(nn.Module):
     def whole_body(self, values: Tensor) -> np.ndarray:
         """What is known of the avatar's vertices, [K], over the whole body, [V] float64; else 0."""
         whole = torch.zeros(self._vertices, dtype=torch.float64)
-        whole[self.avatar.kept] = values.double()
+        whole[self.avatar.kept] = values.double().cpu()
         return whole.numpy()
 
     def due(self, iteration: int) -> bool:

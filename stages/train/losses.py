@@ -9,6 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from pipeline.avatar.sparse import SparsePair
+from pipeline.device import kernels_serve
 from stages.train.ssim import fused_ssim
 
 WINDOW = 11  # pixels, of SSIM's Gaussian window
@@ -33,7 +34,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         target: [H, W, 3].
     """
     known = image.dtype == target.dtype and image.dtype in (torch.float32, torch.float64)
-    if image.device.type != "cpu" or target.requires_grad or not known:
+    if not kernels_serve(image) or target.requires_grad or not known:
         return plain_ssim(image, target)
     return fused_ssim(image, target, _window(), (C1, C2))
 

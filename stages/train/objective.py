@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Posed, Surface
+from pipeline.device import moved
 from pipeline.metrics import Lpips
 from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
@@ -97,7 +98,7 @@ class Objective:
         """Reads nothing.
 
         Args:
-            avatar: what is trained.
+            avatar: what is trained; everything else goes where it is.
             poses: fitted; they move if they are refined.
             evidence: the training frames, with a texture if the face loss has a weight.
             settings: the weights.
@@ -112,10 +113,11 @@ class Objective:
             raise ValueError("the face term needs a texture")
         if settings.scenery and evidence.scenery is None:
             raise ValueError("the scenery term needs the background")
-        self.avatar, self.poses, self.evidence, self.settings = avatar, poses, evidence, settings
-        self.network, self.regularisers = network, Regularisers(settings)
+        self.avatar, self.poses, self.settings = avatar, poses, settings
+        self.evidence, self.regularisers = moved(evidence, avatar.device), Regularisers(settings)
+        self.network = None if network is None else network.to(avatar.device)
         self.watch: Watch | None = None
-        self.sight = Sight(evidence.frames, len(avatar.surfaces[-1].canonical))
+        self.sight = Sight(evidence.frames, len(avatar.surfaces[-1].canonical)).to(avatar.device)
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
         """The weighted terms, averaged over the frames of the step.
@@ -130,7 +132,7 @@ class Objective:
         total: Terms = {}
         for draw in draws:
             for name, value in self._frame_terms(decoded, draw, level, poses_move).items():
-                total[name] = total.get(name, torch.zeros(())) + value / batch
+                total[name] = total.get(name, torch.zeros_like(value)) + value / batch
         return {**total, **self.regularisers.static(decoded)}
 
     def draw(self, position: int) -> Draw:
@@ -139,17 +141,18 @@ class Objective:
         frame = schedule.drawn_of_two(seed, *self.evidence.sources, settings.generated_every, position)
         timeless = schedule.drawn_share(seed, schedule.TIME, position) < settings.time_dropout
         length = 6 * (self.poses.poses.rotation.shape[1] - 1)
+        device = self.avatar.device
         return Draw(
             position=position,
             frame=frame,
-            background=schedule.drawn_background(seed, position),
-            noise=settings.pose_noise * schedule.drawn_noise(seed, position, length),
+            background=schedule.drawn_background(seed, position).to(device),
+            noise=settings.pose_noise * schedule.drawn_noise(seed, position, length).to(device),
             time=None if timeless else self.evidence.times.get(frame),
             place=schedule.drawn_share(seed, schedule.CROP, position),
         )
 
     def _frame_terms(self, decoded: Decoded, draw: Draw, level: int, poses_move: bool) -> Terms:
-        settings, view = self.settings, self.evidence.views[draw.frame]
+        settings, view = self.settings, moved(self.evidence.views[draw.frame], self.avatar.device)
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
         posed = self._pose(decoded, pose, draw, level)
         rendering = render(posed.gaussians, view.camera)

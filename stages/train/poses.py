@@ -36,16 +36,14 @@ class PoseRefinement(nn.Module):
         """Starts at the fitted poses.
 
         Args:
-            poses: of the whole clip.
+            poses: of the whole clip; the changes are where they are.
             frames: the frame numbers whose poses may change: the training frames.
         """
         super().__init__()
         self.poses = poses
         self.rows = {frame: row for row, frame in enumerate(poses.frames)}
-        width = poses.expression.shape[1]
-        self.rotation = _each(frames, (55, 3))
-        self.expression = _each(frames, (width,))
-        self.transl = _each(frames, (3,))
+        still = poses.rotation[0], poses.expression[0], poses.transl[0]
+        self.rotation, self.expression, self.transl = (_each(frames, pose) for pose in still)
 
     def fitted(self, frame: int) -> FramePose:
         """The pose that the fit gave a frame."""
@@ -70,17 +68,17 @@ class PoseRefinement(nn.Module):
         return torch.cat(parts).square().mean()
 
     def refined(self, frames: tuple[int, ...] | None = None) -> Poses:
-        """Poses as they now are, of all frames or of some."""
+        """Poses as they now are, of all frames or of some; on the CPU."""
         frames = self.poses.frames if frames is None else frames
         with torch.no_grad():
             each = [self(frame) for frame in frames]
         return Poses(
             frames=frames,
-            rotation=torch.stack([pose.rotation for pose in each]),
-            expression=torch.stack([pose.expression for pose in each]),
-            transl=torch.stack([pose.transl for pose in each]),
+            rotation=torch.stack([pose.rotation for pose in each]).cpu(),
+            expression=torch.stack([pose.expression for pose in each]).cpu(),
+            transl=torch.stack([pose.transl for pose in each]).cpu(),
         )
 
 
-def _each(frames: tuple[int, ...], shape: tuple[int, ...]) -> nn.ParameterDict:
-    return nn.ParameterDict({str(frame): nn.Parameter(torch.zeros(shape)) for frame in frames})
+def _each(frames: tuple[int, ...], pose: Tensor) -> nn.ParameterDict:
+    return nn.ParameterDict({str(frame): nn.Parameter(torch.zeros_like(pose)) for frame in frames})

@@ -16,6 +16,7 @@ from torch import Tensor
 from pipeline.avatar import Canonical, Decoded, Posed, Surface
 from pipeline.avatar.canonical import HANDS
 from pipeline.avatar.sparse import SparsePair
+from pipeline.device import moved
 from stages.train import losses
 from stages.train.settings import TrainSettings
 
@@ -135,7 +136,7 @@ def unmixed(rows: Tensor, neighbours: SparsePair, count: int) -> Tensor:
     Returns:
         [N, 1] float32.
     """
-    inside = torch.zeros(count, 1).index_fill_(0, rows, 1.0)
+    inside = torch.zeros(count, 1, device=rows.device).index_fill_(0, rows, 1.0)
     return ((neighbours @ inside - inside).abs() < 1e-3).float()
 
 
@@ -144,7 +145,7 @@ def part_weights(canonical: Canonical, settings: TrainSettings) -> PartWeights:
     hands, face = canonical.is_part(*HANDS), canonical.is_part("face")
 
     def weight(rest: float, of_hands: float | None = None, of_face: float | None = None) -> Tensor:
-        values = torch.full((len(canonical), 1), rest)
+        values = torch.full((len(canonical), 1), rest, device=hands.device)
         values[hands] = rest if of_hands is None else of_hands
         values[face] = rest if of_face is None else of_face
         return values
@@ -165,10 +166,10 @@ def undersides(canonical: Canonical) -> Undersides | None:
 
     In the rest pose the arms lie along X, so a slice of an arm is a range of X.
     """
-    up, along = canonical.frames[:, 1, 2], canonical.vertices[:, :1].numpy()
+    up, along = canonical.frames[:, 1, 2].cpu(), canonical.vertices[:, :1].cpu().numpy()
     rows, columns, start = [], [], []
     for arm in ARMS:
-        inside = canonical.is_part(arm)
+        inside = canonical.is_part(arm).cpu()
         above, below = (torch.nonzero(inside & side)[:, 0] for side in (up > STEEP, up < -STEEP))
         if not len(above):
             continue
@@ -186,4 +187,5 @@ def undersides(canonical: Canonical) -> Undersides | None:
         return None
     lower, row, column = torch.cat(start), torch.cat(rows), torch.cat(columns)
     share = 1.0 / torch.bincount(row, minlength=len(lower))[row].float()
-    return Undersides(lower, SparsePair.build(row, column, share, (len(lower), len(canonical))))
+    pairs = Undersides(lower, SparsePair.build(row, column, share, (len(lower), len(canonical))))
+    return moved(pairs, canonical.vertices.device)

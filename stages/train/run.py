@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
+from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
@@ -93,7 +94,10 @@ def train_subject(context: Context) -> None:
     """Reads the inputs, trains what the plan calls for, and writes what is published."""
     inputs = read_inputs(context)
     settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
-    refinement = PoseRefinement(inputs.all_poses, inputs.split.train)
+    device = resolve(settings.device)
+    context.log(f"computes on {device}")
+    context.timing("device", str(device))
+    refinement = PoseRefinement(moved(inputs.all_poses, device), inputs.split.train)
     started = time.monotonic()
     avatar, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
@@ -148,7 +152,7 @@ def read_inputs(context: Context) -> Inputs:
 def prepare(
     inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context
 ) -> tuple[Avatar, Tensor | None]:
-    """The untrained avatar: what to keep of the body, and its first colours.
+    """The untrained avatar, where the poses are: what to keep of the body, and its first colours.
 
     Returns:
         The avatar, and the texture of the face loss, [N, 3]; None where it has no weight.
@@ -158,6 +162,7 @@ def prepare(
     rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
     body, identity, sizes = inputs.body, inputs.identity, architecture(settings)
     avatar = Avatar(body, identity, rows, sizes, settings.seed, settings.half_precision)
+    avatar.to(refinement.poses.rotation.device)
     avatar.pose_heads_active = avatar.residuals_active = False
     set_time_range(avatar, inputs)
     texture = None
@@ -168,7 +173,7 @@ def prepare(
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)
-    avatar.gate(kept[rows])
+    avatar.gate(kept[rows].to(avatar.device))
     parts = ", ".join(region.part for region in avatar.surface().residual) or "no part"
     context.log(
         f"{int(kept.sum())} of {len(kept)} body vertices are kept, {len(avatar)} Gaussians; "
@@ -178,20 +183,20 @@ def prepare(
 
 
 def keep(inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context) -> Tensor:
-    """The body vertices that get a Gaussian to begin with, [V] bool.
+    """The body vertices that get a Gaussian to begin with, [V] bool on the CPU.
 
     Raises:
         UserError: no training frame has any of the body in its picture.
     """
     everything = torch.arange(len(inputs.body.v_template))
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
-    body = Avatar(inputs.body, inputs.identity, everything, bare)
+    body = Avatar(inputs.body, inputs.identity, everything, bare).to(refinement.poses.rotation.device)
     seen = ever_in_frame(body, refinement, inputs.crops, inputs.split.train)
     if not bool(seen.any()):
         raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
     if not (settings.gate and settings.early_gate):
-        return torch.ones_like(seen)
-    return with_surroundings(body, seen, settings.gate_rings)
+        return torch.ones(len(seen), dtype=torch.bool)
+    return with_surroundings(body, seen, settings.gate_rings).cpu()
 
 
 def set_time_range(avatar: Avatar, inputs: Inputs) -> None:

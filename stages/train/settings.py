@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 # Written out, because settings are read where torch is not imported; tests compare them with the
-# originals in pipeline/avatar/residual.py and pipeline/metrics/lpips.py.
+# originals in pipeline/device.py, pipeline/avatar/residual.py and pipeline/metrics/lpips.py.
 NETWORKS = ("alex", "vgg")
 PLACES = ("canonical", "posed")
 SKINNINGS = ("own", "nearest")
+DEVICES = ("auto", "cpu", "cuda")
 DEFINITIONS = ("in_frame", "contributes")
 GUARDS = ("evidence", "authors")
 UNSEEN = ("nothing", "base", "generated")
@@ -50,6 +51,10 @@ class TrainSettings:
     held_out_frames: int = 3  # frames of each such point
     checkpoint_every: int = 250  # iterations between checkpoints
     threads: int = 1  # of the CPU, 0 for all; on 2 cores one is faster at this size (docs/results.md)
+
+    # auto: cuda where there is a GPU and gsplat. Equal runs give equal bytes on a CPU only, and the key of an
+    # artifact holds this word, not what it came to mean (pipeline/device.py); run.json does.
+    device: str = "auto"  # where it computes: auto, cpu or cuda
 
     # Representation
     subdivisions: int = 1  # levels of midpoint subdivision: 0, 1 or 2
@@ -160,6 +165,7 @@ class TrainSettings:
         self._require(("lpips_network",), lambda value: value in NETWORKS, f"be one of {', '.join(NETWORKS)}")
         words = {
             "residual_place": PLACES, "gate_definition": DEFINITIONS, "gate_guard": GUARDS, "unseen": UNSEEN,
+            "device": DEVICES,
         }  # fmt: skip
         for name, known in words.items():
             self._require((name,), lambda value, known=known: value in known, f"be one of {', '.join(known)}")

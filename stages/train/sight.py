@@ -49,7 +49,7 @@ class Sight(nn.Module):
         place = self._places[frame]
         if int(self.levels[place]) != level:
             return None
-        bits = self.bits[place, :, None] >> torch.arange(8, dtype=torch.uint8)
+        bits = self.bits[place, :, None] >> torch.arange(8, dtype=torch.uint8, device=self.bits.device)
         seen = (bits & 1).flatten()
         return torch.nonzero(seen[:count] if kept is None else seen[kept])[:, 0]
 
@@ -62,8 +62,10 @@ class Sight(nn.Module):
             weights: [N], each Gaussian's summed blending weight.
             kept: as for ``rows``.
         """
-        place, seen = self._places[frame], torch.zeros(8 * self.bits.shape[1], dtype=torch.uint8)
-        seen[torch.arange(len(weights)) if kept is None else kept] = (weights > 0).to(torch.uint8)
-        powers = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8)
+        place, device = self._places[frame], self.bits.device
+        seen = torch.zeros(8 * self.bits.shape[1], dtype=torch.uint8, device=device)
+        drawn = torch.arange(len(weights), device=device) if kept is None else kept
+        seen[drawn] = (weights > 0).to(torch.uint8)
+        powers = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8, device=device)
         self.bits[place] = (seen.view(-1, 8) * powers).sum(1, dtype=torch.uint8)
         self.levels[place] = level

@@ -16,6 +16,7 @@ from torch import Tensor
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.avatar.sparse import SparsePair
+from pipeline.device import moved
 from pipeline.splat import Gaussians, render
 from pipeline.visibility import body_in_frame
 from stages.train.data import Frames
@@ -37,10 +38,11 @@ def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: 
         views: the cameras.
         frames: frame numbers.
     """
-    seen = torch.zeros(len(avatar.kept), dtype=torch.bool)
+    seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
     for frame in frames:
         pose = poses.fitted(frame)
-        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, views.camera(frame))
+        camera = moved(views.camera(frame), avatar.device)
+        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, camera)
     return seen
 
 
@@ -55,9 +57,9 @@ def fill_unseen(avatar: Avatar) -> None:
     if surface.rows is None:
         return
     with torch.no_grad():
-        color = torch.zeros(len(full.canonical), 3)
+        color = torch.zeros(len(full.canonical), 3, device=avatar.device)
         color[surface.rows] = torch.sigmoid(avatar.decode().color_logit)
-        known = torch.zeros(len(color), 1)
+        known = torch.zeros(len(color), 1, device=avatar.device)
         known[surface.rows] = 1
         filled = torch.logit(fill(color, known, full.neighbours).clamp(DARKEST, BRIGHTEST))
         avatar.base_color.copy_(torch.where(known > 0, avatar.base_color, filled))
@@ -104,9 +106,9 @@ def _shown(
     Returns:
         [N, 3] and [N, 1].
     """
-    total, weight = torch.zeros(len(avatar), 3), torch.zeros(len(avatar), 1)
+    total, weight = (torch.zeros(len(avatar), width, device=avatar.device) for width in (3, 1))
     for frame in chosen:
-        view = views[frame]
+        view = moved(views[frame], avatar.device)
         with torch.no_grad():
             gaussians = _gaussians(avatar, poses, frame)
         colors = gaussians.colors.clone().requires_grad_()

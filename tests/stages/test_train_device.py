@@ -1,0 +1,140 @@
+"""Training off the CPU: with plain torch in the kernels' place, and on a pretended device. No GPU is here."""
+
+import pytest
+import torch
+
+from pipeline import curves
+from pipeline.avatar import heads, load_avatar, posing
+from pipeline.body import load_body
+from pipeline.device import moved
+from pipeline.splat import render
+from pipeline.tables import read_table
+from stages.train import gate, loop, losses, objective, visibility
+from stages.train import run as stage
+from tests.pretend_device import DEVICE, Elsewhere, pretend_device
+from tests.stages.train_subject import BODY_FILE, context_for, write_subject
+
+ALL_ON = {
+    "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
+    "subdivisions": 1, "subdivide_from": 0.4, "gate_definition": "contributes", "skinning": "nearest",
+    "skin_every": 3, "unseen": "base", "arm_color": 0.1, "hand_color": 0.1, "hand_normal": 0.1,
+    "scale_size": 0.1, "pose_change": 0.1, "scenery": 0.1, "time_dropout": 0.5, "mask_refine": True,
+    "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
+}  # fmt: skip
+RENDERERS = (objective, loop, visibility, gate)
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
+    return folder
+
+
+def without_kernels(monkeypatch):
+    for module in (posing, heads, losses):
+        monkeypatch.setattr(module, "kernels_serve", lambda tensor: False)
+
+
+def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
+    """The loss terms of some steps, and the gradients of the last one."""
+    context = context_for(subject, output, **ALL_ON)
+    inputs = stage.read_inputs(context)
+    refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
+    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
+    generator = torch.Generator().manual_seed(5)
+    for parameter in avatar.parameters():  # no head is silent
+        parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
+    scored = gate.Gate(avatar, len(inputs.body.v_template), context.settings)
+    evidence = inputs.evidence(texture, context.settings)
+    trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
+    values = [trainer.step() for _ in range(count)]
+    named = {**dict(avatar.named_parameters()), **dict(refinement.named_parameters())}
+    return values, {name: one.grad for name, one in named.items() if one.grad is not None}
+
+
+def test_steps_in_plain_torch_are_those_of_the_kernels(subject, tmp_path, monkeypatch):
+    terms, gradients = steps(subject, tmp_path / "kernels")
+    without_kernels(monkeypatch)
+    plain_terms, plain_gradients = steps(subject, tmp_path / "plain")
+    for ours, plain in zip(terms, plain_terms, strict=True):
+        assert ours == pytest.approx(plain, rel=1e-3)
+    assert gradients.keys() == plain_gradients.keys()
+    assert {"triplane.planes", "pose_geometry.first.weight"} <= gradients.keys()
+    for name, ours in gradients.items():
+        plain = plain_gradients[name]
+        assert (ours - plain).norm() <= 1e-2 * plain.norm() + 1e-7, name
+
+
+def rendered_on_the_cpu(gaussians, camera, backend="auto"):
+    """Stands for gsplat: what the Gaussians' device shows, computed on the CPU."""
+    assert isinstance(gaussians.means, Elsewhere) and isinstance(camera.rotation, Elsewhere)
+    rendering = render(gaussians.to("cpu"), camera.to("cpu"))
+    return moved(rendering, DEVICE)
+
+
+def pretend(monkeypatch):
+    monkeypatch.setattr(stage, "resolve", lambda word: DEVICE)
+    for module in RENDERERS:
+        monkeypatch.setattr(module, "render", rendered_on_the_cpu)
+    plain = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda *given, fused, **more: plain(*given, **more))
+
+
+def curve_of(output) -> dict[tuple[int, str], float]:
+    rows = read_table(output / "curve.parquet", curves.SCHEMA, "")
+    return {
+        (step, name): value
+        for step, name, value in zip(rows["iteration"], rows["name"], rows["value"], strict=True)
+    }
+
+
+def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_path, monkeypatch):
+    here = context_for(subject, tmp_path / "here", **ALL_ON)
+    stage.run(here)
+    pretend(monkeypatch)
+    there = context_for(subject, tmp_path / "there", **ALL_ON)
+    with pretend_device():
+        stage.run(there)
+    ours, theirs = curve_of(here.output), curve_of(there.output)
+    assert theirs == pytest.approx(ours, rel=2e-2)
+    avatars = [load_avatar(one.output / "avatar.safetensors", load_body(BODY_FILE)) for one in (here, there)]
+    assert all(tensor.device.type == "cpu" for tensor in avatars[1].state_dict().values())
+    assert torch.equal(avatars[0].active, avatars[1].active)
+    still = torch.zeros(55, 3), torch.zeros(5), torch.zeros(3)
+    with torch.no_grad():
+        colors = [avatar.gaussians(*still).colors for avatar in avatars]
+    torch.testing.assert_close(*colors, rtol=0, atol=0.03)
+
+
+def test_a_checkpoint_from_elsewhere_is_gone_on_from_on_the_cpu(subject, tmp_path, monkeypatch):
+    pretend(monkeypatch)
+    original, context = loop.Trainer.step, context_for(subject, tmp_path / "out", **ALL_ON)
+
+    class Killed(BaseException):
+        pass
+
+    def step(self):
+        if self.iteration == 3:
+            raise Killed
+        return original(self)
+
+    monkeypatch.setattr(stage.Trainer, "step", step)
+    with pretend_device(), pytest.raises(Killed):
+        stage.run(context)
+    monkeypatch.undo()
+    messages = []
+    context.log = messages.append
+    stage.run(context)
+    assert any("goes on from iteration 2" in message for message in messages)
+    assert (context.output / "avatar.safetensors").exists()
+
+
+def test_the_pretended_device_refuses_what_cuda_refuses():
+    with pretend_device() as device:
+        values = torch.ones(3, device=device)
+        assert float((2 * values * torch.tensor(2.0)).sum()) == 12
+        with pytest.raises(RuntimeError, match="left on the CPU"):
+            values + torch.ones(3)
+        with pytest.raises((RuntimeError, TypeError)):
+            values.numpy()
