@@ -49,14 +49,6 @@ WAYS: Mapping[str, Mapping[str, str]] = {
     SOFT_MASK: {},
     "band of 2": {"train.mask_band": "2"},
     "band of 4": {"train.mask_band": "4"},
-    "band of 4, own alpha": {"train.mask_band": "4", "train.mask_refine": "true"},
-    "soft alpha, scenery": {"train.scenery": "0.8"},
-    "band of 4, scenery": {"train.mask_band": "4", "train.scenery": "0.8"},
-    "band of 4, own alpha, scenery": {
-        "train.mask_band": "4",
-        "train.mask_refine": "true",
-        "train.scenery": "0.8",
-    },
 }
 QUICK = (TRUE, SOFT_MASK)
 

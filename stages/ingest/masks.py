@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.background import learn
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.keypoints import BODY, Keypoints
-from stages.ingest.background import log_odds, take_out
+from stages.ingest.background import learn, log_odds, take_out
 from stages.ingest.edges import follow_edges
 from stages.ingest.steady import steady
 

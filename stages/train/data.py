@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.background import learn
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
@@ -38,38 +37,10 @@ class View:
     generated: bool = False
     trust: Tensor | None = None  # [H, W]
 
-    def composite(self, background: Tensor, alpha: Tensor | None = None) -> Tensor:
-        """The person over a plain background, [3] -> [H, W, 3].
-
-        Args:
-            background: [3].
-            alpha: [H, W], another mask than the view's own.
-        """
-        shown = (self.alpha if alpha is None else alpha)[..., None]
-        return self.color * shown + (1 - shown) * background
-
-
-@dataclasses.dataclass(frozen=True)
-class Scenery:
-    """What stands still behind the person in all crops of a clip.
-
-    Attributes:
-        color: [H, W, 3] in [0, 1].
-        known: [H, W] in [0, 1]; 0 where the camera or the scene moves, or the person always stands.
-    """
-
-    color: Tensor  # [H, W, 3]
-    known: Tensor  # [H, W]
-
-
-def scenery_of(views: Frames, frames: tuple[int, ...]) -> Scenery:
-    """The background that the captured frames share, learnt where the person is elsewhere."""
-    pairs = ((views[frame].color, views[frame].alpha) for frame in frames)
-    background = learn(((255 * color).numpy(), alpha.numpy()) for color, alpha in pairs)
-    if background is None:
-        raise ValueError("no frame to learn the background from")
-    mean, _, known = background.model()
-    return Scenery(torch.from_numpy(mean) / 255, torch.from_numpy(known))
+    def composite(self, background: Tensor) -> Tensor:
+        """The person over a plain background, [3] -> [H, W, 3]."""
+        alpha = self.alpha[..., None]
+        return self.color * alpha + (1 - alpha) * background
 
 
 class Frames:

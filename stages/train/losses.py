@@ -67,7 +67,7 @@ def _window() -> Tensor:
 
 
 def over(color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-    """Premultiplied colour over a background: [H, W, 3], [H, W], [3] or [H, W, 3] -> [H, W, 3]."""
+    """Premultiplied colour over a background: [H, W, 3], [H, W], [3] -> [H, W, 3]."""
     return color + (1 - alpha)[..., None] * background
 
 
@@ -97,35 +97,6 @@ def believed(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         weight: [H, W] in [0, 1].
     """
     return target + weight[..., None] * (image - target)
-
-
-def refined_alpha(alpha: Tensor, own: Tensor, trust: Tensor) -> Tensor:
-    """A mask that gives way to the avatar's own alpha where it is in doubt, [H, W]; no gradient.
-
-    Compared over a mask that is its own, an avatar is told its colour there and nothing of its outline.
-
-    Args:
-        alpha: [H, W], the soft mask.
-        own: [H, W], the avatar's alpha.
-        trust: [H, W] in [0, 1], how far the mask is to be believed.
-    """
-    return (trust * alpha + (1 - trust) * own).detach()
-
-
-def before_scenery(color: Tensor, alpha: Tensor, scenery: Tensor, frame: Tensor, known: Tensor) -> Tensor:
-    """The mean absolute difference of the avatar before the real background from the frame itself, scalar.
-
-    It needs no mask: a pixel that shows the background may be left empty, and one that does not must be
-    covered. The joint scene model of ExAvatar with a picture in the place of background Gaussians.
-
-    Args:
-        color: [H, W, 3], the avatar, premultiplied.
-        alpha: [H, W], its alpha.
-        scenery: [H, W, 3], what stands behind the person.
-        frame: [H, W, 3], as filmed.
-        known: [H, W] in [0, 1], how far the scenery is known.
-    """
-    return (known[..., None] * (over(color, alpha, scenery) - frame).abs()).mean()
 
 
 def laplacian(values: Tensor, neighbours: SparsePair, weight: Tensor | float = 1.0) -> Tensor:

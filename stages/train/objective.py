@@ -13,7 +13,7 @@ from pipeline.device import moved
 from pipeline.metrics import Lpips
 from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
-from stages.train.data import Frames, Scenery, View
+from stages.train.data import Frames, View
 from stages.train.face import face_loss, face_triangles, paste
 from stages.train.perceptual import crop, due, perceptual
 from stages.train.poses import FramePose, PoseRefinement
@@ -36,14 +36,12 @@ class Evidence:
         times: seconds of frames from the clip's start; a frame without a clock is not in it.
         texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
             no term asks for it.
-        scenery: what stands behind the person; None where no term asks for it.
     """
 
     views: Frames
     frames: tuple[int, ...]
     times: Mapping[int, float]
     texture: Tensor | None = None
-    scenery: Scenery | None = None
 
     @property
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -111,8 +109,6 @@ class Objective:
             raise ValueError("the LPIPS term needs its network")
         if settings.face and evidence.texture is None:
             raise ValueError("the face term needs a texture")
-        if settings.scenery and evidence.scenery is None:
-            raise ValueError("the scenery term needs the background")
         self.avatar, self.poses, self.settings = avatar, poses, settings
         self.evidence, self.regularisers = moved(evidence, avatar.device), Regularisers(settings)
         self.network = None if network is None else network.to(avatar.device)
@@ -177,33 +173,20 @@ class Objective:
         """How the rendering differs from the frame, both over the drawn background."""
         settings = self.settings
         image = losses.over(rendering.color, rendering.alpha, draw.background)
-        target = self._target(rendering, view, draw)
-        if settings.mask_band and not settings.mask_refine:
+        target = view.composite(draw.background)
+        if settings.mask_band:
             image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
         if view.trust is not None:
             image = losses.believed(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
         terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}
-        if settings.scenery and self.evidence.scenery is not None and not view.generated:
-            behind = self.evidence.scenery
-            scene = (rendering.color, rendering.alpha, behind.color, view.color, behind.known)
-            terms["scenery"] = settings.scenery * losses.before_scenery(*scene)
         if self.network is not None and lpips and self._lpips_due(draw):
             place = crop(view.alpha, settings.lpips_crop, draw.place)
             # As many times the weight, so that its mean over the run is that of a term of every frame.
             distance = perceptual(self.network, image, target, place)
             terms["lpips"] = lpips * settings.lpips_every * distance
         return terms
-
-    def _target(self, rendering: Rendering, view: View, draw: Draw) -> Tensor:
-        """What the rendering should be: the frame's person over the drawn background."""
-        settings = self.settings
-        if not (settings.mask_band and settings.mask_refine):
-            return view.composite(draw.background)
-        trust = losses.trust(view.alpha, settings.mask_band)
-        own = rendering.alpha.detach()
-        return view.composite(draw.background, losses.refined_alpha(view.alpha, own, trust))
 
     def _lpips_due(self, draw: Draw) -> bool:
         settings = self.settings

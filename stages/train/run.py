@@ -24,7 +24,7 @@ from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.costs import saved
-from stages.train.data import Frames, scenery_of, spread
+from stages.train.data import Frames, spread
 from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
@@ -68,11 +68,10 @@ class Inputs:
         """The poses of captured and generated frames."""
         return joined(self.poses, self.generated.poses) if self.generated else self.poses
 
-    def evidence(self, texture: Tensor | None, settings: TrainSettings) -> Evidence:
+    def evidence(self, texture: Tensor | None) -> Evidence:
         """The training frames, and the mean colours that they show, [N, 3]."""
         made = self.generated.frames if self.generated else ()
-        scenery = scenery_of(self.crops, self.split.train) if settings.scenery else None
-        return Evidence(self.views, (*self.split.train, *made), self.times, texture, scenery)
+        return Evidence(self.views, (*self.split.train, *made), self.times, texture)
 
 
 def run(context: Context) -> None:
@@ -102,7 +101,7 @@ def train_subject(context: Context) -> None:
     avatar, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
     gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
-    trainer = Trainer(avatar, refinement, inputs.evidence(texture, settings), settings, network, gate)
+    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network, gate)
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context)
     trainer.require_finite()

@@ -32,7 +32,7 @@ AMOUNTS = (
     "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "plane_learning_rate",
     "pose_learning_rate", "offset_unit", "pose_offset_unit", "seed", "pose_noise",
     "threads", "place_frequencies", "time_frequencies", "lpips_crop", "mask_band", "l1", "ssim", "lpips",
-    "scenery", "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
+    "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
     "laplacian_scale_face", "laplacian_color", "laplacian_color_hands", "offset", "offset_hands",
     "offset_face", "pose_offset", "hand_normal", "scale_size", "scale_size_hands", "scale_growth",
     "hand_color", "arm_color", "residual_size", "pose_change",
@@ -122,8 +122,6 @@ class TrainSettings:
     generated_every: int = 5  # draws for one of a generated frame; the paper's is 2, equally often
     generated: float = 0.1  # lambda_L1, lambda_ssim and lambda_lpips on generated frames
     mask_band: int = 0  # pixels on either side of the silhouette where the mask is in doubt; 0: believed
-    mask_refine: bool = False  # in that band take the avatar's own alpha for the mask, not nothing
-    scenery: float = 0.0  # L1 of the avatar before the clip's own background, where that is known
 
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: float = 1e3  # smoothness of static and of all offsets together

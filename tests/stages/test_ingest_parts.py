@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.background import learn
 from pipeline.detection.estimator import estimator_scale
 from pipeline.detection.wholebody import Landmarks, detour, score_faces, score_hands, to_keypoints
 from pipeline.errors import UserError
 from pipeline.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
 from stages.ingest import people
-from stages.ingest.background import take_out
+from stages.ingest.background import learn, take_out
 from stages.ingest.edges import follow_edges
 from stages.ingest.masks import (
     fill_holes,

@@ -53,7 +53,7 @@ def trainer_for(context) -> Trainer:
     refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
     avatar, texture = stage.prepare(inputs, refinement, settings, context)
     gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
-    return Trainer(avatar, refinement, inputs.evidence(texture, settings), settings, gate=gate)
+    return Trainer(avatar, refinement, inputs.evidence(texture), settings, gate=gate)
 
 
 def bytes_of(folder) -> dict[str, bytes]:

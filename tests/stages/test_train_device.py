@@ -18,7 +18,7 @@ ALL_ON = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
     "subdivisions": 1, "subdivide_from": 0.4, "gate_definition": "contributes", "skinning": "nearest",
     "skin_every": 3, "unseen": "base", "arm_color": 0.1, "hand_color": 0.1, "hand_normal": 0.1,
-    "scale_size": 0.1, "pose_change": 0.1, "scenery": 0.1, "time_dropout": 0.5, "mask_refine": True,
+    "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5, "mask_band": 1,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
 RENDERERS = (objective, loop, visibility, gate)
@@ -46,7 +46,7 @@ def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
     scored = gate.Gate(avatar, len(inputs.body.v_template), context.settings)
-    evidence = inputs.evidence(texture, context.settings)
+    evidence = inputs.evidence(texture)
     trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]
     named = {**dict(avatar.named_parameters()), **dict(refinement.named_parameters())}

@@ -65,7 +65,7 @@ def objective_of(subject, output, **changes):
     inputs = stage.read_inputs(context)
     refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
     avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
-    evidence = inputs.evidence(texture, context.settings)
+    evidence = inputs.evidence(texture)
     return stage.Trainer(avatar, refinement, evidence, context.settings, None, None).objective
 
 

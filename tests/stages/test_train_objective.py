@@ -57,7 +57,7 @@ def scene(subject, output, **changes) -> Scene:
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    return Scene(context.settings, avatar, refinement, inputs.evidence(texture, context.settings))
+    return Scene(context.settings, avatar, refinement, inputs.evidence(texture))
 
 
 @pytest.fixture(scope="module")
@@ -184,29 +184,6 @@ def test_mask_in_doubt_lowers_what_the_silhouette_costs(objective):
     assert values[0] > values[1] > values[2] > 0
 
 
-def test_own_alpha_in_the_band_of_doubt_costs_less_than_the_mask_and_more_than_nothing(objective):
-    believed, own, ignored = (
-        float(objective(mask_band=band, mask_refine=refine)(0, 0, False)["l1"].detach())
-        for band, refine in ((0, False), (3, True), (3, False))
-    )
-    assert believed > own > ignored > 0
-
-
-def test_scenery_is_compared_with_captured_frames_only(subject):
-    made = scene(subject, subject / "scenery", scenery=0.5)
-    behind = made.evidence.scenery
-    assert behind is not None and 0 < float(behind.known.mean()) < 1
-    still = behind.color[behind.known > 0]
-    torch.testing.assert_close(still, torch.full_like(still, 0.5), atol=0.02, rtol=0)  # grey, as it was made
-    everywhere = dataclasses.replace(behind, known=torch.ones_like(behind.known))
-    made = dataclasses.replace(made, evidence=dataclasses.replace(made.evidence, scenery=everywhere))
-    term = made.objective()(0, 0, False)["scenery"]
-    double = made.objective(scenery=1.0)(0, 0, False)["scenery"]
-    assert float(term.detach()) > 0 and float(double.detach()) == pytest.approx(2 * float(term.detach()))
-    assert "scenery" not in made.objective(generated=range(6))(0, 0, False)
-    assert "scenery" not in made.objective(scenery=0.0)(0, 0, False)
-
-
 def test_lpips_begins_when_it_is_told_to(objective):
     late = objective(lpips=0.2, lpips_every=1, lpips_from=0.5)  # of 12 iterations
     assert ["lpips" in late(iteration, 0, False) for iteration in (5, 6, 11)] == [False, True, True]
@@ -228,5 +205,3 @@ def test_term_that_lacks_what_it_needs_is_refused(objective):
         Objective(made.avatar, made.poses, bare, made.settings)
     with pytest.raises(ValueError, match="LPIPS"):
         Objective(made.avatar, made.poses, made.evidence, dataclasses.replace(made.settings, lpips=0.2))
-    with pytest.raises(ValueError, match="scenery"):
-        Objective(made.avatar, made.poses, made.evidence, dataclasses.replace(made.settings, scenery=0.5))

@@ -166,27 +166,3 @@ def test_spread_of_colour_pulls_towards_a_mean_that_stays():
     assert float(value.detach()) == pytest.approx(2 * 0.25 / 6)
     value.backward()
     torch.testing.assert_close(colors.grad, (colors.detach() - colors.detach().mean(0)) * 2 / 6)
-
-
-def test_refined_mask_is_the_mask_where_it_is_believed_and_the_avatars_elsewhere():
-    alpha, own = torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[0.2, 0.2, 0.6]], requires_grad=True)
-    trust = torch.tensor([[1.0, 0.0, 0.5]])
-    refined = losses.refined_alpha(alpha, own, trust)
-    torch.testing.assert_close(refined, torch.tensor([[1.0, 0.2, 0.3]]))
-    assert not refined.requires_grad
-
-
-def test_before_scenery_asks_for_no_mask():
-    scenery, known = torch.full((2, 2, 3), 0.5), torch.ones(2, 2)
-    frame = scenery.clone()
-    frame[0, 0] = torch.tensor([0.9, 0.1, 0.3])  # the person
-    color, alpha = torch.zeros(2, 2, 3), torch.zeros(2, 2)
-    missing = losses.before_scenery(color, alpha, scenery, frame, known)
-    assert float(missing) == pytest.approx((0.4 + 0.4 + 0.2) / 12)
-    color[0, 0], alpha[0, 0] = frame[0, 0], 1.0
-    assert float(losses.before_scenery(color, alpha, scenery, frame, known)) == 0
-    known[0, 1], color[0, 1] = 0.0, 1.0  # where nothing is known nothing is asked
-    assert float(losses.before_scenery(color, alpha, scenery, frame, known)) == 0
-    color, alpha = (torch.rand(one, dtype=torch.float64, requires_grad=True) for one in ((2, 2, 3), (2, 2)))
-    rest = (scenery.double(), frame.double(), known.double())
-    assert torch.autograd.gradcheck(lambda c, a: losses.before_scenery(c, a, *rest), (color, alpha))
