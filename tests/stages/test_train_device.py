@@ -58,7 +58,7 @@ def test_steps_in_plain_torch_are_those_of_the_kernels(subject, tmp_path, monkey
     without_kernels(monkeypatch)
     plain_terms, plain_gradients = steps(subject, tmp_path / "plain")
     for ours, plain in zip(terms, plain_terms, strict=True):
-        assert ours == pytest.approx(plain, rel=1e-3)
+        assert ours == pytest.approx(plain, rel=1e-3, abs=5e-6)  # 1 - SSIM is a difference of near ones
     assert gradients.keys() == plain_gradients.keys()
     assert {"triplane.planes", "pose_geometry.first.weight"} <= gradients.keys()
     for name, ours in gradients.items():
