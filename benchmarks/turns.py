@@ -1,10 +1,10 @@
 """A turn with and without auxiliary views, and whose face it is: ``python -m benchmarks.turns [--quick]``.
 
 Every subject is trained twice, without auxiliary views and with the ``texture`` generator's. Shown are eight
-sides of both, one row each, in the subject's own pose of the middle held-out frame. Scored are held-out PSNR,
-and face consistency as in the paper's supplement E.2: the embedding's distance and cosine between the face in a
-held-out frame and the rendered one, with dlib in the place of ArcFace. "clip" is the same between held-out frames
-and the middle training frame: what the person's own change of expression amounts to.
+sides of both, one row each, in the subject's own pose of the middle held-out frame. Scored are held-out PSNR
+and face consistency as in the paper's supplement E.2: the embeddings' distance and cosine between the face in
+a held-out frame and the rendered one, with dlib in the place of ArcFace. "clip" is the distance between
+held-out frames and the middle training frame: what the person's own change of expression amounts to.
 """
 
 from __future__ import annotations
