@@ -56,7 +56,8 @@ def moving_poses(count: int = FRAMES) -> Poses:
 def painted_avatar() -> Avatar:
     """The mean body in the colours in which the subject is filmed; nothing of it was learnt."""
     body = load_body(BODY_FILE)
-    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    small = {"width": 16, "groups": 4, "residual_width": 16}
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0, **small)
     avatar = Avatar(body, mean_identity(body), torch.arange(len(body.v_template)), bare).eval()
     avatar.base_color.copy_(2 * torch.sin(9 * body.v_template))
     return avatar

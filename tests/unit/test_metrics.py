@@ -114,10 +114,10 @@ def test_dissimilarity_is_one_minus_ssim_with_a_gradient_downhill(size):
     truth = torch.rand(*size, 3, generator=generator)
     image = (0.7 * truth + 0.3 * torch.rand(*size, 3, generator=generator)).requires_grad_()
     loss = dissimilarity(image, truth)
-    assert float(loss) == pytest.approx(1 - ssim(image, truth), abs=1e-4)
+    assert loss.item() == pytest.approx(1 - ssim(image, truth), abs=1e-4)
     (slope,) = torch.autograd.grad(loss, image)
     shorter = image.detach() - 1e-3 * slope / slope.norm()
-    fallen = float(loss) - (1 - ssim(shorter, truth))
+    fallen = loss.item() - (1 - ssim(shorter, truth))
     assert fallen == pytest.approx(1e-3 * float(slope.norm()), rel=0.05, abs=2e-6)
 
 
