@@ -16,7 +16,12 @@ from pipeline.job import job_from_words, shown, workspace_from_words
 
 MEAN = "mean"
 METRICS = ("psnr", "ssim", "lpips_alex")
-OURS = {"avatar": "here", "nearest_frame": "here, nearest training frame"}
+AVATAR, REFINED = "avatar", "avatar_refined"
+OURS = {
+    AVATAR: "here",
+    REFINED: "here, test poses refined",
+    "nearest_frame": "here, nearest training frame",
+}
 Values = tuple[float | None, ...]
 
 
@@ -60,7 +65,11 @@ def read_summary(artifact: Artifact) -> dict[str, Any]:
     path = artifact.folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        return {"means": summary["means"]["test"], "protocol": str(summary.get("protocol", ""))}
+        return {
+            "means": summary["means"]["test"],
+            "protocol": str(summary.get("protocol", "")),
+            "background": str(summary.get("background", "black")),
+        }
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
 
@@ -96,8 +105,15 @@ def table(
         known = {subject: value for subject, value in values.items() if value}
         if known:
             part = "" if len(known) == len(subjects) else f" ({len(known)} of {len(subjects)} subjects)"
-            lines.append(line(f"**{name}**{part}", with_mean(known, list(known)), columns))
+            name = f"**{name}**" if method == counted(about) else name
+            lines.append(line(f"{name}{part}", with_mean(known, list(known)), columns))
     return "\n".join([*lines, "", *(f"- {remark}" for remark in remarks), ""])
+
+
+def counted(about: Dataset) -> str:
+    """Which of our rows was measured as the published ones were: with test poses refined or not."""
+    asked = about.layer.tables.get("evaluate", {}).get("refine_test_poses")
+    return REFINED if asked == "on" else AVATAR
 
 
 def with_mean(values: Mapping[str, Values], subjects: Sequence[str]) -> dict[str, Values]:
@@ -140,11 +156,27 @@ def average(values: Sequence[float | None]) -> float | None:
     return statistics.fmean(known) if known else None
 
 
+def otherwise(about: Dataset, found: Mapping[str, dict[str, Any]]) -> list[str]:
+    """Which row to compare, and what was not measured as the published numbers were."""
+    if not found or not about.rows:
+        return []
+    remarks = [f"The row to compare is '{OURS[counted(about)]}'"]
+    unrefined = [subject for subject, one in found.items() if counted(about) not in one["means"]]
+    if unrefined:
+        remarks.append(f"Not comparable, test poses were not refined: {', '.join(unrefined)}")
+    wanted = about.layer.tables.get("evaluate", {}).get("background")
+    other = [subject for subject, one in found.items() if wanted and one["background"] != wanted]
+    if other:
+        remarks.append(f"Not comparable, the published numbers are on {wanted}: {', '.join(other)}")
+    return remarks
+
+
 def notes(about: Dataset, found: Mapping[str, tuple[dict[str, Any] | None, bool]]) -> list[str]:
     """What must be said beside the numbers."""
     remarks = [f"Published numbers: {about.protocol}"] if about.protocol else []
     protocols = {one["protocol"] for one, _ in found.values() if one and one["protocol"]}
     remarks += [f"Measured here: {protocol}" for protocol in sorted(protocols)]
+    remarks += otherwise(about, {subject: one for subject, (one, _) in found.items() if one})
     missing = [subject for subject, (one, _) in found.items() if one is None]
     if missing:
         remarks.append(f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}")

@@ -1,7 +1,8 @@
-"""What is compared with what: the person on black, over the whole image and inside the mask.
+"""What is compared with what: the person on black or white, over the whole image and inside the mask.
 
 The mask of a held-out frame limits every score: two good masks of the same frame differ by more at
-their edges than a good render does inside. The interior leaves that edge out.
+their edges than a good render does inside. The interior leaves that edge out, and is measured on black
+whatever the whole image is measured on: a mask is not quite 1 even there.
 """
 
 from __future__ import annotations
@@ -11,6 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+BLACK, WHITE = "black", "white"
+
+BACKGROUNDS = {BLACK: 0.0, WHITE: 1.0}
+"""What a person can be composited on -> the value of its pixels."""
+
 EROSION = 3
 """Pixels by which the mask shrinks to become the interior."""
 
@@ -18,18 +24,34 @@ INSIDE = 0.5
 """The alpha above which a pixel belongs to the person."""
 
 
-def composite(frame: np.ndarray, mask: np.ndarray) -> Tensor:
-    """The person on black: ``frame / 255 * alpha``.
+def composite(frame: np.ndarray, mask: np.ndarray, background: str = BLACK) -> Tensor:
+    """The person cut out: ``frame / 255 * alpha + background * (1 - alpha)``.
 
     Args:
         frame: [H, W, 3] uint8, RGB.
         mask: [H, W] uint8, the person's soft alpha.
+        background: one of ``BACKGROUNDS``.
 
     Returns:
         [H, W, 3] float32 in [0, 1].
     """
     alpha = torch.from_numpy(mask).float() / 255
-    return torch.from_numpy(frame).float() / 255 * alpha[..., None]
+    return over(torch.from_numpy(frame).float() / 255 * alpha[..., None], alpha, background)
+
+
+def over(color: Tensor, alpha: Tensor, background: str = BLACK) -> Tensor:
+    """Premultiplied colour, as a renderer gives it, on a background: ``color + background * (1 - alpha)``.
+
+    Args:
+        color: [H, W, 3], premultiplied with alpha.
+        alpha: [H, W].
+        background: one of ``BACKGROUNDS``.
+
+    Returns:
+        [H, W, 3].
+    """
+    value = BACKGROUNDS[background]
+    return color + value * (1 - alpha)[..., None] if value else color
 
 
 def interior(mask: np.ndarray, erosion: int = EROSION) -> Tensor:

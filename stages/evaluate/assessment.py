@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
+from torch import Tensor
 
 from pipeline.metrics.protocol import interior
 from stages.evaluate.baselines import mean_frame, nearest_frames
-from stages.evaluate.evidence import Evidence, evenly
+from stages.evaluate.evidence import Evidence, Pose, evenly
 from stages.evaluate.pictures import Comparison, compare, person_box
-from stages.evaluate.rendering import Animate, on_black, render_frame
-from stages.evaluate.scoring import AVATAR, HELD_OUT, MEAN, NEAREST, TRAINING, Picture, Score, Scorer
+from stages.evaluate.rendering import Animate, render_frame, scored_picture
+from stages.evaluate.scoring import (
+    AVATAR,
+    HELD_OUT,
+    MEAN,
+    NEAREST,
+    REFINED,
+    TRAINING,
+    Picture,
+    Score,
+    Scorer,
+)
 from stages.evaluate.settings import EvaluateSettings
 
 Advance = Callable[[], object]
@@ -56,7 +67,12 @@ def scored_frames(evidence: Evidence, settings: EvaluateSettings) -> list[tuple[
 
 
 def assess(
-    evidence: Evidence, animate: Animate, scorer: Scorer, settings: EvaluateSettings, advance: Advance
+    evidence: Evidence,
+    animate: Animate,
+    scorer: Scorer,
+    settings: EvaluateSettings,
+    refined: Mapping[int, Pose],
+    advance: Advance,
 ) -> Assessment:
     """Scores the clip.
 
@@ -65,6 +81,7 @@ def assess(
         animate: a pose -> Gaussians.
         scorer: the metrics.
         settings: how many frames.
+        refined: held-out frame -> its refined pose; empty where none was refined.
         advance: called after each scored frame.
     """
     shown = frames_to_show(evidence, settings)
@@ -73,16 +90,20 @@ def assess(
     scores: list[Score] = []
     comparisons: dict[int, Comparison] = {}
     for split, frame in scored_frames(evidence, settings):
-        judge = _Judge(frame, split, scorer, scorer.picture(evidence.person(frame)), evidence.mask(frame))
-        image = on_black(render_frame(animate, evidence, frame))
-        avatar = judge.score(AVATAR, scorer.picture(image))
+        truth = scorer.composited(partial(evidence.person, frame))
+        judge = _Judge(frame, split, scorer, truth, evidence.mask(frame))
+        picture = scorer.composited(partial(scored_picture, render_frame(animate, evidence, frame)))
+        avatar = judge.score(AVATAR, picture)
         scores += avatar
+        if frame in refined:
+            rendering = render_frame(animate, evidence, frame, refined[frame])
+            scores += judge.score(REFINED, scorer.composited(partial(scored_picture, rendering)))
         if split == HELD_OUT:
             scores += judge.score(MEAN, baselines.mean)
             scores += judge.score(NEAREST, baselines.picture(baselines.nearest[frame]))
         if frame in shown:
             psnr = next(one.value for one in avatar if one.metric == "psnr")
-            pair = compare(frame, judge.truth.image, image, settings.error_gain, psnr)
+            pair = compare(frame, truth.image, picture.image, settings.error_gain, psnr)
             comparisons[frame] = pair.cropped(box)
         advance()
     return Assessment(tuple(scores), tuple(comparisons[frame] for frame in shown), baselines.nearest)
@@ -109,10 +130,14 @@ class _Baselines:
         # Neighbouring held-out frames often share their nearest frame.
         @lru_cache(maxsize=2)
         def picture(frame: int) -> Picture:
-            return scorer.picture(evidence.person(frame))
+            return scorer.composited(partial(evidence.person, frame))
 
+        def mean(background: str) -> Tensor:
+            return mean_frame(partial(evidence.person, background=background), training)
+
+        person = partial(evidence.person, background=scorer.background)
         return cls(
-            mean=scorer.picture(mean_frame(evidence.person, training)),
-            nearest=nearest_frames(evidence.person, training, evidence.split.test),
+            mean=scorer.composited(mean),
+            nearest=nearest_frames(person, training, evidence.split.test),
             picture=picture,
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 Person = Callable[[int], Tensor]
-"""Frame number -> the person on black, [H, W, 3] float in [0, 1]."""
+"""Frame number -> the person on the background, [H, W, 3] float in [0, 1]."""
 
 _HELD_AT_ONCE = 32  # held-out frames in memory while the training frames are read past them
 

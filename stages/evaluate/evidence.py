@@ -15,10 +15,13 @@ from pipeline.body.poses import Poses, read_poses
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
-from pipeline.metrics.protocol import composite
+from pipeline.metrics.protocol import BLACK, composite
 from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
 
 Item = TypeVar("Item")
+
+Pose = tuple[Tensor, Tensor, Tensor]
+"""Rotation [55, 3], expression [E] and transl [3] of a frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +52,9 @@ class Evidence:
         """The person's soft alpha, [H, W] uint8."""
         return read_mask(self.folder / "masks", index)
 
-    def person(self, index: int) -> Tensor:
-        """The person on black, [H, W, 3] float32 in [0, 1]."""
-        return composite(self.frame(index), self.mask(index))
+    def person(self, index: int, background: str = BLACK) -> Tensor:
+        """The person on a background, [H, W, 3] float32 in [0, 1]."""
+        return composite(self.frame(index), self.mask(index), background)
 
     def seconds(self, index: int) -> float | None:
         """When the frame was filmed, from the clip's start; None where the source has no clock."""
@@ -59,13 +62,12 @@ class Evidence:
         known = row is not None and row < len(self.footage.seconds)
         return self.footage.seconds[row] if known and row is not None else None
 
-    def pose(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+    def pose(self, index: int) -> Pose:
         """The pose that a frame is rendered in: rotation [55, 3], expression [E], transl [3].
 
         A training frame has the pose that training refined. A held-out frame has the fit's, which
-        knows its keypoints and nothing else of the image. (Refining it on the held-out image itself,
-        test-time pose refinement, would replace the fit's pose here, and its numbers would stand
-        beside these.)
+        knows its keypoints and nothing else of the image. (What refining it on the held-out image
+        itself makes of it is in ``refinement.py``; its numbers stand beside these.)
 
         Raises:
             UserError: neither the fit nor training has a pose for the frame.

@@ -7,8 +7,10 @@ import math
 from collections.abc import Sequence
 
 from pipeline.metrics.lpips import NETWORKS
+from pipeline.plan import Plan
 from stages.evaluate.evidence import Evidence
 from stages.evaluate.records import Gate
+from stages.evaluate.refinement import EFFECT, Refinement
 from stages.evaluate.scoring import HELD_OUT, TRAINING, Score
 from stages.evaluate.settings import EvaluateSettings
 
@@ -29,10 +31,20 @@ class Omission:
 
 
 def omissions(
-    evidence: Evidence, settings: EvaluateSettings, scores: Sequence[Score], gate: Gate
+    evidence: Evidence,
+    settings: EvaluateSettings,
+    scores: Sequence[Score],
+    gate: Gate,
+    plan: Plan,
+    refinement: Refinement,
 ) -> list[Omission]:
     """What ingest, train and evaluate left out of this avatar and of its numbers."""
-    return [*_of_the_clip(evidence), *_of_the_avatar(gate), *_of_the_numbers(evidence, settings, scores)]
+    return [
+        *_of_the_clip(evidence),
+        *_of_the_avatar(gate),
+        *_of_the_numbers(evidence, settings, scores),
+        *_of_the_poses(evidence, settings, plan, refinement),
+    ]
 
 
 def _of_the_clip(evidence: Evidence) -> list[Omission]:
@@ -77,15 +89,28 @@ def _of_the_numbers(
     for network in sorted(set(NETWORKS) - set(settings.lpips_networks)):
         why = f"not asked for (evaluate.lpips_networks){_LPIPS_COST.get(network, '')}"
         found.append(Omission(f"LPIPS with {network}", why))
-    if evidence.split.test:
-        why = (
-            "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels"
-        )
-        found.append(Omission("Test-time pose refinement", why))
     bare = len({one.frame for one in scores if one.split == HELD_OUT and math.isnan(one.value)})
     if bare:
         found.append(Omission("Interior of " + _count(bare, "frame"), "the eroded mask is empty there"))
     return found
+
+
+def _of_the_poses(
+    evidence: Evidence, settings: EvaluateSettings, plan: Plan, refinement: Refinement
+) -> list[Omission]:
+    if refinement.stopped:
+        frames = ", ".join(map(str, refinement.stopped))
+        why = f"the loss of {frames} was not finite: shown in the pose of the fit, under both names"
+        return [Omission("Refinement of " + _count(len(refinement.stopped), "test pose"), why)]
+    if refinement.poses or not evidence.split.test:
+        return []
+    asked = settings.refine_test_poses
+    reason = plan[EFFECT].why if asked == "auto" else f"evaluate.refine_test_poses={asked}"
+    why = (
+        "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels: "
+        + reason
+    )
+    return [Omission("Test-time pose refinement", why)]
 
 
 def _count(number: int, noun: str) -> str:

@@ -23,7 +23,7 @@ class Comparison:
 
     Attributes:
         frame: number in the source clip.
-        truth: [H, W, 3] uint8 RGB, the person on black.
+        truth: [H, W, 3] uint8 RGB, the person on what is scored.
         render: [H, W, 3] uint8 RGB.
         error: [H, W, 3] uint8 RGB, the absolute difference times the gain.
         psnr: dB, of the whole image.

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.bake import bake
+from pipeline.metrics.protocol import BLACK, over
 from pipeline.splat import Gaussians, Rendering, render
-from stages.evaluate.evidence import Evidence
+from stages.evaluate.evidence import Evidence, Pose
 
 GREY = 0.82
 
@@ -27,16 +28,27 @@ def animator(avatar: Avatar) -> Animate:
     return bake(avatar).gaussians
 
 
+def follower(avatar: Avatar) -> Animate:
+    """The avatar as refinement needs it: gradients reach the pose and nothing else.
+
+    A baked avatar has no gradients. What the visibility gate took is not in that one, whatever the avatar
+    says, and so it is not in this one.
+    """
+    avatar.requires_grad_(False)
+    avatar.unseen = "nothing"
+    return avatar.gaussians
+
+
 @torch.no_grad()
-def render_frame(animate: Animate, evidence: Evidence, index: int) -> Rendering:
-    """The avatar in a frame's pose, as that frame's camera sees it, of the stored frame's size."""
-    gaussians = animate(*evidence.pose(index), evidence.seconds(index))
+def render_frame(animate: Animate, evidence: Evidence, index: int, pose: Pose | None = None) -> Rendering:
+    """The avatar in a frame's pose, or another, as its camera sees it, of the stored frame's size."""
+    gaussians = animate(*(pose or evidence.pose(index)), evidence.seconds(index))
     return render(gaussians, evidence.cameras[index])
 
 
-def on_black(rendering: Rendering) -> Tensor:
+def scored_picture(rendering: Rendering, background: str = BLACK) -> Tensor:
     """The picture that is scored: [H, W, 3] float32 in [0, 1]."""
-    return rendering.color.float().clamp(0, 1)
+    return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)
 
 
 def on_grey(rendering: Rendering) -> np.ndarray:

@@ -43,6 +43,7 @@ class Material:
         plan: what the scene called for, a row an effect.
         scores: drawing of the visibility scores, SVG; none where nothing was counted.
         gate: the gate's own sentence.
+        refinement: what refining the test poses took; empty where they were not.
         score_picture: the body coloured by score, where it exists.
         omissions: what was left out.
         stages: upstream first.
@@ -60,6 +61,7 @@ class Material:
     plan: Sequence[PlanRow]
     scores: Sequence[str]
     gate: str
+    refinement: str
     score_picture: Path
     omissions: Sequence[Omission]
     stages: Sequence[StageRecord]
@@ -94,6 +96,7 @@ def _contents(material: Material) -> dict[str, Any]:
         "plan": material.plan,
         "scores": [Markup(drawing) for drawing in material.scores],
         "gate": material.gate,
+        "refinement": material.refinement,
         "score_picture": _overlay([material.score_picture]),
         "omissions": material.omissions,
         "stages": material.stages,

@@ -16,8 +16,8 @@ from pipeline.body import load_body
 from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import shown
-from pipeline.metrics import EROSION, Lpips
-from pipeline.plan import read_plan
+from pipeline.metrics import Lpips
+from pipeline.plan import Plan, read_plan
 from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
@@ -29,17 +29,13 @@ from stages.evaluate.omissions import omissions
 from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
 from stages.evaluate.plan_table import plan_rows
 from stages.evaluate.records import StageRecord, fit_seconds, plan_savings, read_gate, stage_records
-from stages.evaluate.rendering import Animate, animator, on_grey, render_frame
+from stages.evaluate.refinement import NONE, Refinement, called_for, refine, write_refined
+from stages.evaluate.rendering import Animate, animator, follower, on_grey, render_frame
 from stages.evaluate.report import Material, write_report
 from stages.evaluate.scoring import Scorer, table, write_scores
 from stages.evaluate.settings import EvaluateSettings
-from stages.evaluate.summary import show_summary
+from stages.evaluate.summary import protocol, show_summary
 from stages.evaluate.turntable import orbit, relaxed_pose, turn_pictures, visible_extent
-
-PROTOCOL = (
-    "The person is composited on black and compared over the whole image at the stored size; each number is "
-    f"a mean over frames. PSNR is in dB; inside is within the mask (alpha above 0.5) eroded by {EROSION} px."
-)
 
 _COVER_HEIGHT = 400  # pixels
 
@@ -48,23 +44,35 @@ def run(context: Context) -> None:
     """Evaluates the trained avatar of one subject.
 
     Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
-    ``turntable.mp4`` and ``avatar.ply``.
+    ``turntable.mp4`` and ``avatar.ply``, and ``test_poses.parquet`` where the test poses were refined.
 
     Raises:
         UserError: a file of an upstream stage or an asset is missing or damaged.
     """
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", load_body(context.body_file))
     networks = {name: Lpips(context.assets["lpips"], name) for name in context.settings.lpips_networks}
-    evaluate(context, read_evidence(context.inputs), animator(avatar), Scorer(networks))
+    scorer = Scorer(networks, context.settings.background)
+    evaluate(context, read_evidence(context.inputs), animator(avatar), follower(avatar), scorer)
 
 
-def evaluate(context: Context, evidence: Evidence, animate: Animate, scorer: Scorer) -> None:
-    """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``."""
+def evaluate(context: Context, evidence: Evidence, animate: Animate, follow: Animate, scorer: Scorer) -> None:
+    """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
+
+    Args:
+        context: of the run.
+        evidence: the clip.
+        animate: a pose -> Gaussians.
+        follow: the same with gradients that reach the pose; asked only where test poses are refined.
+        scorer: the metrics.
+    """
     settings: EvaluateSettings = context.settings
     start = time.monotonic()
+    plan = read_plan(context.inputs["plan"] / "plan.json")
+    refinement = refine_test_poses(context, evidence, plan, follow, scorer.background)
+    scoring = time.monotonic()
     with context.progress(len(scored_frames(evidence, settings)), "scoring") as progress:
-        assessment = assess(evidence, animate, scorer, settings, progress.advance)
-    context.timing("scoring_seconds", time.monotonic() - start)
+        assessment = assess(evidence, animate, scorer, settings, refinement.poses, progress.advance)
+    context.timing("scoring_seconds", time.monotonic() - scoring)
     write_scores(context.output / "metrics.parquet", assessment.scores)
     relaxed = relaxed_gaussians(evidence, animate, settings)
     write_ply(context.output / "avatar.ply", relaxed)
@@ -73,18 +81,47 @@ def evaluate(context: Context, evidence: Evidence, animate: Animate, scorer: Sco
     write_png(context.output / "cover.png", beside(cover))
     sheet = comparison_sheet(assessment.comparisons, settings.error_gain)
     write_png(context.output / "comparison.png", sheet)
-    summary = summarise(context, evidence, assessment, scorer, len(relaxed))
+    summary = summarise(context, evidence, assessment, scorer, refinement, len(relaxed))
     write_json(context.output / "summary.json", summary)
     own = StageRecord("evaluate", as_dict(settings), time.monotonic() - start)
-    material = gather(context, evidence, assessment, summary, cover, own)
+    material = gather(context, evidence, assessment, (plan, refinement), summary, cover, own)
     write_report(context.output / "report.html", material)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def refine_test_poses(
+    context: Context, evidence: Evidence, plan: Plan, follow: Animate, background: str
+) -> Refinement:
+    """Refines the held-out frames' poses where that is called for, and publishes them."""
+    settings: EvaluateSettings = context.settings
+    frames = evidence.split.test
+    if not frames or not called_for(settings, plan):
+        return NONE
+    start = time.monotonic()
+    with context.progress(len(frames), "refining test poses") as progress:
+        refinement = refine(evidence, follow, background, settings.refine_steps, progress.advance)
+    context.timing("refinement_seconds", time.monotonic() - start)
+    write_refined(context.output / "test_poses.parquet", refinement)
+    context.log(refinement_cost(context, refinement))
+    return refinement
+
+
+def refinement_cost(context: Context, refinement: Refinement) -> str:
+    """What refining the test poses took, in a sentence; nothing where they were not refined."""
+    if not refinement.poses:
+        return ""
+    seconds = context.timings["refinement_seconds"]
+    each = f"{len(refinement.poses)} frames, {refinement.steps} steps each"
+    stopped = ", ".join(map(str, refinement.stopped))
+    left = f" The loss of {stopped} was not finite: the pose of the fit was kept there." if stopped else ""
+    return f"Refining the test poses took {seconds:.1f} s: {each}.{left}"
 
 
 def gather(
     context: Context,
     evidence: Evidence,
     assessment: Assessment,
+    decided: tuple[Plan, Refinement],
     summary: dict[str, Any],
     cover: list[np.ndarray],
     own: StageRecord,
@@ -92,7 +129,7 @@ def gather(
     """What the report shows, from this stage and from the upstream stages' folders."""
     fit, train, settings = context.inputs["fit"], context.inputs["train"], context.settings
     gate = read_gate(train)
-    plan = read_plan(context.inputs["plan"] / "plan.json")
+    plan, refinement = decided
     return Material(
         summary=summary,
         clip=describe_clip(evidence),
@@ -106,8 +143,9 @@ def gather(
         plan=plan_rows(plan, plan_savings(train)),
         scores=draw_scores(gate.scores, gate.tau),
         gate=gate.why,
+        refinement=refinement_cost(context, refinement),
         score_picture=train / "visibility.png",
-        omissions=omissions(evidence, settings, assessment.scores, gate),
+        omissions=omissions(evidence, settings, assessment.scores, gate, plan, refinement),
         stages=[*stage_records(context.inputs), own],
     )
 
@@ -163,7 +201,12 @@ def both_sides(gaussians: Gaussians) -> list[np.ndarray]:
 
 
 def summarise(
-    context: Context, evidence: Evidence, assessment: Assessment, scorer: Scorer, gaussians: int
+    context: Context,
+    evidence: Evidence,
+    assessment: Assessment,
+    scorer: Scorer,
+    refinement: Refinement,
+    gaussians: int,
 ) -> dict[str, Any]:
     """What ``summary.json`` holds."""
     return {
@@ -173,7 +216,13 @@ def summarise(
         "metrics": list(scorer.metrics),
         "means": table(assessment.scores, scorer.metrics),
         "nearest": {str(frame): nearest for frame, nearest in sorted(assessment.nearest.items())},
-        "protocol": PROTOCOL,
+        "background": scorer.background,
+        "refined": {
+            "frames": len(refinement.poses),
+            "stopped": list(refinement.stopped),
+            "steps": refinement.steps,
+        },
+        "protocol": protocol(scorer.background, refinement),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pipeline.metrics.image import psnr, ssim
 from pipeline.metrics.lpips import Lpips
+from pipeline.metrics.protocol import BACKGROUNDS, BLACK
 from pipeline.tables import write_table
 
 SCHEMA = pa.schema(
@@ -26,8 +27,8 @@ SCHEMA = pa.schema(
     ]
 )
 
-AVATAR, MEAN, NEAREST = METHODS = ("avatar", "mean_frame", "nearest_frame")
-"""What is scored: the avatar and the two baselines."""
+AVATAR, REFINED, MEAN, NEAREST = METHODS = ("avatar", "avatar_refined", "mean_frame", "nearest_frame")
+"""What is scored: the avatar, the avatar with test poses refined, and the two baselines."""
 
 HELD_OUT, TRAINING = "test", "train"
 """The splits, by their names in split.json."""
@@ -57,19 +58,26 @@ class Picture:
     """An image with the features that LPIPS compares, so that they are computed once.
 
     Attributes:
-        image: [H, W, 3] float in [0, 1].
+        image: [H, W, 3] float in [0, 1], on the background of the scorer.
+        black: [H, W, 3], the same on black, where interiors are measured.
         features: LPIPS backbone -> its features.
     """
 
     image: Tensor  # [H, W, 3]
+    black: Tensor  # [H, W, 3]
     features: Mapping[str, list[Tensor]]
 
 
 class Scorer:
-    """Scores pictures against the truth, with the LPIPS backbones that are loaded."""
+    """Scores pictures against the truth, with the LPIPS backbones that are loaded.
 
-    def __init__(self, networks: Mapping[str, Lpips]) -> None:
-        self.networks = networks
+    Attributes:
+        networks: LPIPS backbone -> the network.
+        background: what all pictures are composited on, one of ``BACKGROUNDS``.
+    """
+
+    def __init__(self, networks: Mapping[str, Lpips], background: str = BLACK) -> None:
+        self.networks, self.background = networks, background
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -77,9 +85,19 @@ class Scorer:
         return ("psnr", "psnr_interior", "ssim", *(f"lpips_{name}" for name in self.networks))
 
     @torch.no_grad()
-    def picture(self, image: Tensor) -> Picture:
-        """An image made ready: [H, W, 3] float in [0, 1]."""
-        return Picture(image, {name: network.features(image) for name, network in self.networks.items()})
+    def picture(self, image: Tensor, black: Tensor | None = None) -> Picture:
+        """An image made ready.
+
+        Args:
+            image: [H, W, 3] float in [0, 1], on the background.
+            black: the same on black; the image itself if None.
+        """
+        features = {name: network.features(image) for name, network in self.networks.items()}
+        return Picture(image, image if black is None else black, features)
+
+    def composited(self, on: Callable[[str], Tensor]) -> Picture:
+        """What ``on`` makes of a background, made ready: [H, W, 3] float in [0, 1]."""
+        return self.picture(on(self.background), None if self.background == BLACK else on(BLACK))
 
     @torch.no_grad()
     def values(self, picture: Picture, truth: Picture, interior: Tensor) -> dict[str, float]:
@@ -87,7 +105,7 @@ class Scorer:
 
         Args:
             picture: what is judged.
-            truth: the person on black.
+            truth: the person.
             interior: [H, W] bool, see :func:`pipeline.metrics.protocol.interior`.
 
         Returns:
@@ -95,8 +113,8 @@ class Scorer:
         """
         values = {
             "psnr": psnr(picture.image, truth.image),
-            "psnr_interior": psnr(picture.image, truth.image, interior),
-            "ssim": ssim(picture.image, truth.image),
+            "psnr_interior": psnr(picture.black, truth.black, interior),
+            "ssim": ssim(picture.image, truth.image, BACKGROUNDS[self.background]),
         }
         for name, network in self.networks.items():
             values[f"lpips_{name}"] = float(network.distance(picture.features[name], truth.features[name]))

@@ -8,13 +8,16 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from stages.evaluate.scoring import AVATAR, HELD_OUT, MEAN, NEAREST, TRAINING
+from pipeline.metrics import EROSION
+from stages.evaluate.refinement import Refinement
+from stages.evaluate.scoring import AVATAR, HELD_OUT, MEAN, NEAREST, REFINED, TRAINING
 
 Means = Mapping[str, Mapping[str, Mapping[str, float | None]]]
 """split -> method -> metric -> mean, see :func:`stages.evaluate.scoring.table`."""
 
 LABELS = {
     (HELD_OUT, AVATAR): "avatar",
+    (HELD_OUT, REFINED): "avatar, test poses refined",
     (HELD_OUT, MEAN): "mean training frame",
     (HELD_OUT, NEAREST): "nearest training frame",
     (TRAINING, AVATAR): "avatar, frames it was trained on",
@@ -43,12 +46,29 @@ def show_summary(summary: Mapping[str, Any], report: str, console: Console | Non
     console = console or Console()
     # Wide enough for the table wherever the output goes: a log file has no width of its own.
     console = console if console.is_terminal else Console(file=console.file, width=100, color_system=None)
-    counts = f"{summary['frames']['train']} frames learnt from, {summary['frames']['test']} held out"
+    frames = summary["frames"]
+    counts = f"{frames['train']} frames learnt from, {frames['test']} held out, on {summary['background']}"
     console.print(f"{summary['subject']}: {summary['gaussians']} Gaussians, {counts}", highlight=False)
     arrows = ("", "") if console.options.ascii_only else (" ↓", " ↑")
     console.print(_table(summary["means"], summary["metrics"], arrows))
     # soft_wrap: a path that is cut in two cannot be clicked or copied.
     console.print(f"report: {report}", soft_wrap=True, highlight=False, markup=False)
+
+
+def protocol(background: str, refinement: Refinement) -> str:
+    """What the numbers were measured on, for tables and for ``summary.json``."""
+    text = (
+        f"The person is composited on {background}, in every picture alike, and compared over the whole "
+        "image at the stored size; each number is a mean over frames. PSNR is in dB; inside is within the "
+        f"mask (alpha above 0.5) eroded by {EROSION} px, on black whatever the rest is on."
+    )
+    if not refinement.poses:
+        return text
+    return (
+        f"{text} Test poses refined: rotation, expression and translation of each held-out frame were fitted "
+        f"to that frame itself ({refinement.steps} steps), all else fixed; the row without it is at the pose "
+        "of the fit."
+    )
 
 
 def rows(means: Means) -> list[tuple[str, str, Mapping[str, float | None]]]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar.sparse import SparsePair
 from pipeline.device import kernels_serve
-from stages.train.ssim import fused_ssim
+from pipeline.metrics.fused_ssim import fused_ssim
 
 WINDOW = 11  # pixels, of SSIM's Gaussian window
 SIGMA = 1.5  # pixels
@@ -27,7 +27,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
     Wang et al. 2004 with a Gaussian window of 11 pixels and sigma 1.5 and the image mirrored at its
     border, the mean over all pixels, as torchmetrics takes it. On a CPU one fused kernel (see
-    ``ssim.py``) where the target needs no gradient; elsewhere ``plain_ssim``.
+    ``pipeline/metrics/fused_ssim.py``) where the target needs no gradient; elsewhere ``plain_ssim``.
 
     Args:
         image: [H, W, 3] in [0, 1], at least 11 pixels along each side.

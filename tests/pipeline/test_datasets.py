@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipeline.compare import table
+from pipeline.compare import notes, table
 from pipeline.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
 from pipeline.errors import UserError
 from pipeline.settings import Layer
@@ -93,6 +93,37 @@ def test_compare_puts_published_rows_beside_ours(many):
     written = (many.store / "compare" / "one.md").read_text()
     assert written.strip() in run.stdout
     assert "compare needs a dataset" in many.doit("compare").stdout
+
+
+def test_the_row_of_the_datasets_own_protocol_is_marked():
+    means = {"avatar": {"psnr": 20.0, "ssim": 0.9, "lpips_alex": 0.1}}
+    refined = {**means, "avatar_refined": {"psnr": 25.0, "ssim": 0.9, "lpips_alex": 0.1}}
+    found = {
+        "a": {"means": refined, "protocol": "on white, refined", "background": "white"},
+        "b": {"means": means, "protocol": "on black", "background": "black"},
+    }
+    rows = (Row("T", {"b": (1.0, 2.0, 3.0)}),)
+    as_neuman = Layer("x", {"evaluate": {"background": "white", "refine_test_poses": "on"}})
+    about = Dataset("x", "X", "", "theirs", as_neuman, "", rows)
+    said = notes(about, {name: (one, True) for name, one in found.items()})
+    assert "The row to compare is 'here, test poses refined'" in said
+    assert "Not comparable, test poses were not refined: b" in said
+    assert "Not comparable, the published numbers are on white: b" in said
+    text = table(about, ["a", "b"], found, said)
+    assert "| **here, test poses refined** (1 of 2 subjects) | 25.00 / 0.900 / 10.00 | - |" in text
+    assert "| here | 20.00" in text
+    plain = Dataset("x", "X", "", "theirs", Layer("x", {"evaluate": {"background": "black"}}), "", rows)
+    assert "| **here** | 20.00" in table(plain, ["a", "b"], found, [])
+    said = notes(plain, {"b": (found["b"], True)})
+    assert "The row to compare is 'here'" in said and not any("Not comparable" in one for one in said)
+
+
+def test_neuman_is_judged_as_its_paper_does():
+    workspace = open_workspace()
+    tables = load_dataset(workspace, "neuman").layer.tables
+    assert tables["evaluate"] == {"background": "white", "refine_test_poses": "on"}
+    for name in ("talkshow", "zju"):
+        assert load_dataset(workspace, name).layer.tables["evaluate"] == {"background": "black"}
 
 
 def test_a_dataset_without_published_numbers_has_a_table_too():

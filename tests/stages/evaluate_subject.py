@@ -77,13 +77,15 @@ class Clip:
             stage="evaluate",
         )
 
-    def evaluate(self, animate=stand_in, name="out", **settings):
+    def evaluate(self, animate=stand_in, name="out", follow=None, **settings):
         context = self.context(name, **settings)
-        evaluate(context, read_evidence(self.inputs), animate, Scorer({}))
+        scorer = Scorer({}, context.settings.background)
+        evaluate(context, read_evidence(self.inputs), animate, follow or animate, scorer)
         return context.output
 
 
-def make_clip(root, test=TEST):
+def make_clip(root, test=TEST, soft=False):
+    """``soft``: masks are the alpha, and frames show the blob's colour undimmed. Else hard masks."""
     inputs = {name: root / name for name in ("ingest", "fit", "plan", "train")}
     for folder in (*inputs.values(), inputs["ingest"] / "frames", inputs["ingest"] / "masks"):
         folder.mkdir()
@@ -91,9 +93,10 @@ def make_clip(root, test=TEST):
     camera, poses = facing_camera(WIDTH, HEIGHT, 70.0), moving_poses()
     for row, frame in enumerate(FRAMES):
         rendering = render(stand_in(poses.rotation[row], None, poses.transl[row], None), camera)
-        seen = rendering.alpha > 0
-        write_frame(ingest / "frames", frame, (rendering.color * 255).round().byte().numpy())
-        write_mask(ingest / "masks", frame, (seen * 255).byte().numpy())
+        alpha = rendering.alpha if soft else (rendering.alpha > 0).float()
+        color = rendering.color / rendering.alpha[..., None].clamp(min=1e-6) if soft else rendering.color
+        write_frame(ingest / "frames", frame, (color.clamp(0, 1) * 255).round().byte().numpy())
+        write_mask(ingest / "masks", frame, (alpha * 255).round().byte().numpy())
     write_cameras(ingest / "cameras.parquet", dict.fromkeys(FRAMES, camera))
     write_split(ingest / "split.json", Split(tuple(f for f in FRAMES if f not in test), test))
     dropped = {"no person was found": 2, "unreadable": 0}
@@ -114,5 +117,5 @@ def make_clip(root, test=TEST):
         train / "visibility.parquet", captured=kept * 1.0, generated=kept * 0.0, early=~kept, kept=kept
     )
     write_json(train / "gate.json", {"tau": 0.5, "why": "20% of the body is under 0.50", "definition": "x"})
-    write_plan(plan / "plan.json", plan_of(pose_heads=False))
+    write_plan(plan / "plan.json", plan_of(pose_heads=False, test_time_refinement=False))
     return Clip(root, inputs)

@@ -182,7 +182,7 @@ def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip
 
 def test_what_users_name_is_escaped(clip):
     context = dataclasses.replace(clip.context(), subject="<script>x</script>")
-    evaluate(context, read_evidence(clip.inputs), stand_in, Scorer({}))
+    evaluate(context, read_evidence(clip.inputs), stand_in, stand_in, Scorer({}))
     assert "<script>" not in (context.output / "report.html").read_text()
 
 
@@ -251,6 +251,9 @@ def test_the_path_is_where_the_store_will_publish(tmp_path):
         ({"turntable_width": 481}, "turntable_width must be even"),
         ({"training_frames": 0}, "training_frames must be at least 1"),
         ({"baseline_frames": -1}, "baseline_frames must be at least 0"),
+        ({"background": "grey"}, "background must be one of black, white, not grey"),
+        ({"refine_test_poses": "yes"}, "refine_test_poses must be one of auto, on, off"),
+        ({"refine_steps": 0}, "refine_steps must be at least 1"),
         ({"error_gain": 0.0}, "error_gain must be above 0"),
     ],
 )

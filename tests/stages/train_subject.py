@@ -53,16 +53,22 @@ def moving_poses(count: int = FRAMES) -> Poses:
     return Poses(tuple(range(count)), rotation, torch.zeros(count, 5), transl)
 
 
+def painted_avatar() -> Avatar:
+    """The mean body in the colours in which the subject is filmed; nothing of it was learnt."""
+    body = load_body(BODY_FILE)
+    small = {"width": 16, "groups": 4, "residual_width": 16}
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0, **small)
+    avatar = Avatar(body, mean_identity(body), torch.arange(len(body.v_template)), bare).eval()
+    avatar.base_color.copy_(2 * torch.sin(9 * body.v_template))
+    return avatar
+
+
 def write_subject(folder: Path) -> None:
     """Writes ``ingest``, ``fit`` and ``plan`` as those stages would publish them."""
     ingest, fit, plan = folder / "ingest", folder / "fit", folder / "plan"
     for made in (ingest / "frames", ingest / "masks", fit, plan):
         made.mkdir(parents=True)
-    body, poses = load_body(BODY_FILE), moving_poses()
-    identity = mean_identity(body)
-    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
-    avatar = Avatar(body, identity, torch.arange(len(body.v_template)), bare).eval()
-    avatar.base_color.copy_(2 * torch.sin(9 * body.v_template))
+    body, poses, avatar = load_body(BODY_FILE), moving_poses(), painted_avatar()
     camera = facing_camera(WIDTH, HEIGHT, 1.2 * HEIGHT)
     for frame in poses.frames:
         with torch.no_grad():
@@ -76,7 +82,7 @@ def write_subject(folder: Path) -> None:
     footage = Footage("made", WIDTH, HEIGHT, 10.0, 1.0, FRAMES, FRAMES, {}, 1, seconds, {})
     write_footage(ingest / "footage.json", footage)
     write_split(ingest / "split.json", Split(train=poses.frames[:-1], test=poses.frames[-1:]))
-    write_identity(fit / "identity.safetensors", identity, body)
+    write_identity(fit / "identity.safetensors", avatar.identity, body)
     write_poses(fit / "poses.parquet", poses)
     unseen = {"left_hand_residual": False, "right_hand_residual": False}  # they hang below the picture
     write_plan(plan / "plan.json", plan_of(**unseen))

@@ -1,4 +1,6 @@
-"""Structural similarity and its gradient at once on a CPU; ``losses.plain_ssim`` is the plain twin.
+"""Structural similarity and its gradient at once on a CPU.
+
+Its plain twins are torchmetrics and ``plain_ssim`` of the train stage's losses; tests hold them together.
 
 Four local means are enough: of both images, of the sum of their squares and of their product. The loss is a
 scalar, so its gradient is known but for a factor as soon as its value is: the derivatives with respect to

@@ -1,0 +1,253 @@
+"""What the person is composited on, and held-out poses refined on their own images."""
+
+import dataclasses
+import io
+import json
+import math
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from rich.console import Console
+
+from pipeline.body import read_poses, write_poses
+from pipeline.camera import project
+from pipeline.frames import read_mask, write_mask
+from pipeline.metrics import psnr
+from pipeline.plan import write_plan
+from stages.evaluate.evidence import read_evidence
+from stages.evaluate.refinement import NONE, called_for, refine, refined_pose
+from stages.evaluate.rendering import follower, render_frame, scored_picture
+from stages.evaluate.settings import EvaluateSettings
+from stages.evaluate.summary import protocol, show_summary
+from tests.plans import plan_of
+from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
+from tests.stages.train_subject import moving_poses as body_poses
+from tests.stages.train_subject import painted_avatar, write_subject
+
+
+@pytest.fixture
+def clip(tmp_path):
+    return make_clip(tmp_path, soft=True)
+
+
+def displace(clip):
+    """The fit's poses 2 cm aside: 0.7 pixels of the tiny clip."""
+    write_poses(clip.inputs["fit"] / "poses.parquet", moving_poses(shift=0.02))
+
+
+def summary_of(output):
+    return json.loads((output / "summary.json").read_text())
+
+
+def held_out(output):
+    return summary_of(output)["means"]["test"]
+
+
+def must_not_be_asked(*_):
+    raise AssertionError("nothing is refined, so nothing needs a gradient")
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    """A displaced clip whose plan calls for refinement, evaluated without it, with it, and with it again."""
+    clip = make_clip(tmp_path_factory.mktemp("displaced"), soft=True)
+    displace(clip)
+    write_plan(clip.inputs["plan"] / "plan.json", plan_of())
+    off = clip.evaluate(name="off", follow=must_not_be_asked, refine_test_poses="off")
+    return off, *(clip.evaluate(name=name, refine_steps=30) for name in ("on", "again"))
+
+
+# The background
+
+
+def test_the_interior_does_not_depend_on_the_background_and_the_rest_does(clip):
+    for frame in FRAMES:  # a mask that is not quite 1 inside, as masks are
+        mask = read_mask(clip.inputs["ingest"] / "masks", frame)
+        write_mask(clip.inputs["ingest"] / "masks", frame, (mask * 0.8).astype(np.uint8))
+    black, white = (clip.evaluate(name=name, background=name) for name in ("black", "white"))
+    for split, method in (("test", "avatar"), ("test", "mean_frame"), ("train", "avatar")):
+        one, other = (summary_of(output)["means"][split][method] for output in (black, white))
+        assert one["psnr_interior"] == other["psnr_interior"]
+        assert one["psnr"] != other["psnr"] and one["ssim"] != other["ssim"]
+    for output in (black, white):
+        summary = summary_of(output)
+        assert summary["background"] == output.name
+        assert f"composited on {output.name}" in summary["protocol"]
+        assert f"composited on {output.name}" in (output / "report.html").read_text()
+        text = io.StringIO()
+        show_summary(summary, "report.html", Console(file=text))
+        assert f"held out, on {output.name}" in text.getvalue()
+
+
+def test_on_white_every_picture_stands_on_white_and_refines_there(clip):
+    displace(clip)
+    means = held_out(clip.evaluate(background="white", refine_test_poses="on", refine_steps=30))
+    assert means["mean_frame"]["psnr"] < means["nearest_frame"]["psnr"] < means["avatar"]["psnr"]
+    assert means["avatar_refined"]["psnr"] > means["avatar"]["psnr"] + 5
+    evidence = read_evidence(clip.inputs)
+    drawn = scored_picture(render_frame(stand_in, evidence, TEST[0]), "white")
+    for picture in (evidence.person(TEST[0], "white"), drawn):
+        assert torch.equal(picture[0, 0], torch.ones(3))  # a corner where nobody stands
+
+
+# Refinement of the whole stage
+
+
+def test_refined_numbers_stand_beside_the_others(outputs):
+    off, on, _ = outputs
+    before, after = held_out(off), held_out(on)
+    assert after.pop("avatar_refined")["psnr"] > before["avatar"]["psnr"] + 5
+    assert after == before
+    moved = read_poses(on / "test_poses.parquet")
+    assert moved.frames == TEST and bool(moved.valid.all())
+    error = (moved.transl - moving_poses().transl[-3:])[:, :2].abs()
+    assert float(error.max()) < 0.005  # of 0.02 metres
+    rows = pq.read_table(on / "metrics.parquet").to_pylist()
+    assert {row["frame"] for row in rows if row["method"] == "avatar_refined"} == set(TEST)
+
+
+def test_the_refinement_is_shown_and_no_longer_left_out(outputs):
+    report, text = (outputs[1] / "report.html").read_text(), io.StringIO()
+    show_summary(summary_of(outputs[1]), "report.html", Console(file=text))
+    assert "avatar, test poses refined" in report and "avatar, test poses refined" in text.getvalue()
+    assert "Refining the test poses took" in report and "Test-time pose refinement" not in report
+    assert "(30 steps)" in summary_of(outputs[1])["protocol"]
+
+
+def test_off_leaves_nothing_behind_and_says_why(outputs):
+    off = outputs[0]
+    assert "avatar_refined" not in held_out(off) and not (off / "test_poses.parquet").exists()
+    assert summary_of(off)["refined"] == {"frames": 0, "stopped": [], "steps": 0}
+    report = (off / "report.html").read_text()
+    assert "Test-time pose refinement" in report and "evaluate.refine_test_poses=off" in report
+
+
+def test_equal_runs_give_equal_bytes(outputs):
+    for name in ("test_poses.parquet", "metrics.parquet", "summary.json", "comparison.png"):
+        assert (outputs[1] / name).read_bytes() == (outputs[2] / name).read_bytes(), name
+
+
+def test_a_plan_that_does_not_call_for_it_is_obeyed_and_quoted(clip):
+    output = clip.evaluate(follow=must_not_be_asked)
+    assert "avatar_refined" not in held_out(output) and "made up" in (output / "report.html").read_text()
+
+
+@pytest.mark.parametrize("asked", ["on", "off"])
+@pytest.mark.parametrize("planned", [True, False])
+def test_the_setting_overrules_the_plan(asked, planned):
+    plan = plan_of(test_time_refinement=planned)
+    assert called_for(EvaluateSettings(refine_test_poses=asked), plan) == (asked == "on")
+    assert called_for(EvaluateSettings(), plan) == planned
+
+
+def test_without_held_out_frames_nothing_is_refined(tmp_path):
+    output = make_clip(tmp_path, test=(), soft=True).evaluate(
+        follow=must_not_be_asked, refine_test_poses="on"
+    )
+    assert summary_of(output)["refined"]["frames"] == 0
+
+
+# Where it breaks
+
+
+def test_a_frame_that_is_not_finite_keeps_its_fitted_pose_and_says_so(clip, capsys):
+    poses = moving_poses()
+    poses.expression[-2] = math.nan  # the blob has no face: it is drawn all the same
+    write_poses(clip.inputs["fit"] / "poses.parquet", poses)
+    output = clip.evaluate(refine_test_poses="on", refine_steps=3)
+    assert summary_of(output)["refined"]["stopped"] == [TEST[1]]
+    kept = read_poses(output / "test_poses.parquet")
+    assert kept.valid.tolist() == [True, False, True]
+    assert torch.equal(kept.transl[1], poses.transl[-2])
+    assert f"The loss of {TEST[1]} was not finite" in capsys.readouterr().out
+    assert "Refinement of 1 test pose" in (output / "report.html").read_text()
+    assert set(held_out(output)["avatar_refined"]) == set(held_out(output)["avatar"])
+
+
+def fitted_pose():
+    return torch.zeros(55, 3), torch.zeros(4), torch.zeros(3)
+
+
+def test_a_loss_or_gradient_that_is_not_finite_stops():
+    calls = []
+
+    def breaks(pose):
+        calls.append(1)
+        return pose[2].sum() * (math.nan if len(calls) == 3 else 1)
+
+    assert refined_pose(breaks, fitted_pose(), 10) is None and len(calls) == 3
+    # The square root's slope at zero is infinite, its value is not.
+    assert refined_pose(lambda pose: pose[2].abs().sum().sqrt(), fitted_pose(), 10) is None
+
+
+def test_the_best_pose_met_is_kept():
+    start = fitted_pose()
+    # Adam's first step of 1e-3 leaps over this minimum.
+    found = refined_pose(lambda pose: (pose[2] - 1e-5).abs().sum(), start, 3)
+    assert torch.equal(found[2], start[2])
+    nearer = refined_pose(lambda pose: (pose[2] - 0.02).square().sum(), start, 60)
+    assert torch.allclose(nearer[2], torch.full((3,), 0.02), atol=2e-3)
+    assert torch.equal(nearer[0], start[0])  # what the loss does not look at stays
+
+
+@pytest.mark.parametrize("mask", [0, 255], ids=["nobody", "everything"])
+def test_a_useless_mask_leaves_finite_poses(clip, mask):
+    write_mask(clip.inputs["ingest"] / "masks", TEST[0], np.full((HEIGHT, WIDTH), mask, np.uint8))
+    poses = refine(read_evidence(clip.inputs), stand_in, "black", 4, lambda: None).poses
+    assert all(bool(part.isfinite().all()) for pose in poses.values() for part in pose)
+
+
+# A body
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    """The painted body of the train stage's tests, one frame held out, and the poses it was filmed in."""
+    folder = tmp_path_factory.mktemp("body")
+    write_subject(folder)
+    (folder / "train").mkdir()
+    write_poses(folder / "train" / "poses.parquet", body_poses())
+    return read_evidence({name: folder / name for name in ("ingest", "fit", "plan", "train")})
+
+
+def score(evidence, animate, pose):
+    frame = evidence.split.test[0]
+    return psnr(scored_picture(render_frame(animate, evidence, frame, pose)), evidence.person(frame))
+
+
+@torch.no_grad()
+def off_by(evidence, animate, pose):
+    """How far the Gaussians inside the picture are from where they were filmed, a mean in pixels."""
+    camera = evidence.cameras[evidence.split.test[0]]
+    true = project(camera, animate(*evidence.pose(evidence.split.test[0]), None).means)
+    seen = ((true > 0) & (true < torch.tensor([camera.width, camera.height]))).all(1)
+    return float((project(camera, animate(*pose, None).means) - true)[seen].norm(dim=1).mean())
+
+
+def test_a_displaced_body_comes_back_and_the_networks_stay(subject):
+    poses = body_poses()
+    poses.rotation[-1, 15] += torch.tensor([0.05, 0.08, 0.0])
+    poses.transl[-1] += torch.tensor([0.012, -0.01, 0.0])
+    displaced = dataclasses.replace(subject, fitted=poses)
+    avatar = painted_avatar()
+    networks = {name: value.numpy().tobytes() for name, value in avatar.state_dict().items()}
+    animate, frame = follower(avatar), subject.split.test[0]
+    before, after = displaced.pose(frame), refine(displaced, animate, "black", 24, lambda: None).poses[frame]
+    assert score(subject, animate, after) > score(subject, animate, before) + 3
+    far = off_by(subject, animate, before)  # pixels
+    assert far > 2 and off_by(subject, animate, after) < far / 4
+    assert {name: value.numpy().tobytes() for name, value in avatar.state_dict().items()} == networks
+    assert all(weight.grad is None for weight in avatar.parameters())
+
+
+def test_a_perfect_pose_is_left_alone(subject):
+    animate, frame = follower(painted_avatar()), subject.split.test[0]
+    found = refine(subject, animate, "black", 6, lambda: None).poses[frame]
+    assert score(subject, animate, found) > score(subject, animate, subject.pose(frame)) - 0.1
+    assert float((found[2] - subject.pose(frame)[2]).abs().max()) < 0.003  # metres
+
+
+def test_the_protocol_names_what_was_done():
+    assert "refined" not in protocol("black", NONE)
