@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from stages.fit.pose_files import write_peer_files
 
 from pipeline.body import mean_identity, pose_body, read_identity, read_poses
 from pipeline.camera import Camera
@@ -18,6 +17,7 @@ from pipeline.pose_files import (
     read_hand_mean,
     read_record,
     with_flat_hands,
+    write_peer_files,
     write_record,
 )
 from pipeline.stage import Context
