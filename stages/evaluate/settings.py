@@ -2,9 +2,9 @@
 
 import dataclasses
 
-from pipeline.metrics.protocol import BACKGROUNDS
-
 _NETWORKS = ("alex", "vgg")
+# As in pipeline/metrics/protocol.py, which is too heavy to load here; a test compares them.
+_BACKGROUNDS = ("black", "white")
 _CHOICES = ("auto", "on", "off")
 
 
@@ -58,6 +58,6 @@ class EvaluateSettings:
                 raise ValueError(f"evaluate.{name} must be above 0, not {getattr(self, name)}")
 
     def _check_words(self) -> None:
-        for name, known in (("background", tuple(BACKGROUNDS)), ("refine_test_poses", _CHOICES)):
+        for name, known in (("background", _BACKGROUNDS), ("refine_test_poses", _CHOICES)):
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"evaluate.{name} must be one of {', '.join(known)}, not {value}")

@@ -14,8 +14,9 @@ from rich.console import Console
 from pipeline.body import read_poses, write_poses
 from pipeline.camera import project
 from pipeline.frames import read_mask, write_mask
-from pipeline.metrics import psnr
+from pipeline.metrics import BACKGROUNDS, psnr
 from pipeline.plan import write_plan
+from stages.evaluate import settings as evaluate_settings
 from stages.evaluate.evidence import read_evidence
 from stages.evaluate.refinement import NONE, called_for, refine, refined_pose
 from stages.evaluate.rendering import follower, render_frame, scored_picture
@@ -251,3 +252,7 @@ def test_a_perfect_pose_is_left_alone(subject):
 
 def test_the_protocol_names_what_was_done():
     assert "refined" not in protocol("black", NONE)
+
+
+def test_the_setting_knows_every_background():
+    assert tuple(BACKGROUNDS) == evaluate_settings._BACKGROUNDS
