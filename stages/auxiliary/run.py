@@ -69,11 +69,13 @@ def run(context: Context) -> None:
 
 def chosen_generator(context: Context) -> str:
     """The setting, or what the plan calls for where it is ``auto``; off where there is no plan."""
-    generator = context.settings.generator
+    generator, plan = context.settings.generator, context.inputs.get("plan")
+    called_for = plan is not None and read_plan(plan / "plan.json").on("auxiliary_views")
+    if generator == "off" and called_for:
+        context.log("the plan asks for views that no frame shows: auxiliary.generator=auto makes them")
     if generator != "auto":
         return generator
-    plan = context.inputs.get("plan")
-    return "texture" if plan is not None and read_plan(plan / "plan.json").on("auxiliary_views") else "off"
+    return "texture" if called_for else "off"
 
 
 def painted(clip: Clip, turn: Turn, surface: texture.FineSurface, colors: np.ndarray) -> Offer:

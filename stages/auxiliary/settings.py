@@ -14,9 +14,9 @@ MEASURED = ("mimicmotion", "folder")  # generators whose frames have to be looke
 class AuxiliarySettings:
     """Settings of the auxiliary stage."""
 
-    # auto: texture where the plan asks for auxiliary views, else off. guidance: only what a generator
-    # elsewhere needs.
-    generator: str = "auto"
+    # auto: texture where the plan asks for auxiliary views, else off; it costs a minute and some of the seen
+    # side's quality, so that the quick preset leaves it. guidance: only what a generator elsewhere needs.
+    generator: str = "off"
     folder: str = ""  # of folder: frames that somebody made, or a video file
     weights: str = ""  # of mimicmotion: the folder with the model's weights
 

@@ -5,7 +5,7 @@ from stages.fit.settings import FitSettings
 
 STAGE = Stage(
     name="fit",
-    version=5,
+    version=6,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={

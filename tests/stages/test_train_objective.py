@@ -113,8 +113,7 @@ def test_pictures_reach_every_head(objective):
 
 
 def test_lpips_of_every_kth_draw_has_k_times_the_weight(objective):
-    # The two have drawn other frames before, and what was seen then must not matter here.
-    whole = {"lpips": 0.2, "pose_seen_only": False}
+    whole = {"lpips": 0.2}
     every, third = objective(lpips_every=1, **whole), objective(lpips_every=3, **whole)
     assert ["lpips" in third(iteration, 0, False) for iteration in range(4)] == [True, False, False, True]
     for position in (0, 3):
@@ -123,7 +122,7 @@ def test_lpips_of_every_kth_draw_has_k_times_the_weight(objective):
 
 
 def test_second_draw_of_a_frame_poses_what_the_first_one_showed(objective):
-    made, whole = objective(face=0.0), objective(face=0.0, pose_seen_only=False)
+    made, whole = objective(face=0.0, pose_seen_only=True), objective(face=0.0)
     frame, count = made.draw(0).frame, len(made.avatar)
     assert made.sight.rows(frame, 0, count) is None  # and so the first draw poses all
     first, expected = (terms(0, 0, False) for terms in (made, whole))
