@@ -259,8 +259,10 @@ def test_off_costs_nothing(full, tmp_path):
 
 
 def test_auto_goes_by_the_plan(full, tmp_path):
-    context = context_for(full, tmp_path / "auto")
+    context = context_for(full, tmp_path / "auto", generator="auto")
     assert stage.chosen_generator(context) == "texture"
+    quick = context_for(full, tmp_path / "quick")  # leaves them out, and says what would make them
+    assert stage.chosen_generator(quick) == "off" and "auxiliary.generator=auto" in quick.logged[-1]
     shutil.copytree(full / "plan", tmp_path / "plan")
     write_plan(tmp_path / "plan" / "plan.json", plan_of(auxiliary_views=False))
     context.inputs["plan"] = tmp_path / "plan"

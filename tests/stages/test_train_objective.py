@@ -137,7 +137,7 @@ def test_second_draw_of_a_frame_poses_what_the_first_one_showed(objective):
 
 
 def test_what_was_left_out_by_mistake_is_posed_again_at_the_next_draw(objective):
-    made = objective()
+    made = objective(pose_seen_only=True)
     frame, count = made.draw(0).frame, len(made.avatar)
     made(0, 0, False)
     right = made.sight.rows(frame, 0, count)
