@@ -37,7 +37,7 @@ SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}
 SIDES, SIZE, GREY = 8, (192, 256), 0.82
 HELD_OUT = 6  # frames that are scored
-BASE = {"train.iterations": "250", "train.subdivisions": "0", "train.held_out_frames": "0"}
+BASE = {"train.iterations": "200", "train.subdivisions": "0", "train.held_out_frames": "0"}
 
 
 @dataclasses.dataclass(frozen=True)
