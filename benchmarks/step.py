@@ -6,8 +6,8 @@ and before anything is timed their images and their gradients are compared. They
 that what else the machine does falls on all. All have the fast rasterizer, SSIM and regularisers, and the
 allocator's settings: what differs is the model's own arithmetic, and Adam's.
 
-"ours" asks the pose heads only for the Gaussians that the frame shows, as training does
-(``train.pose_seen_only``), as known from the last time that the frame was drawn; the others would get no
+"ours" asks the pose heads only for the Gaussians that the frame shows, as training does under
+``train.pose_seen_only``, as known from the last time that the frame was drawn; the others would get no
 gradient from it. "ours, all" asks them for every Gaussian.
 """
 
