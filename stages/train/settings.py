@@ -73,7 +73,7 @@ class TrainSettings:
     )
     skin_every: int = 100  # iterations between two looks at which vertex is nearest
     pose_heads_from: float = 0.4  # fraction of the run from which the pose heads take part; 1: never
-    # Pose and residual heads: only what the frame saw when last drawn. A seventh of a step at 40,000 Gaussians,
+    # Pose and residual heads: what the frame saw when last drawn. A seventh of a step at 40,000 Gaussians,
     # nothing at 10,000; what no frame sees then has the answers of heads that were never asked there.
     pose_seen_only: bool = False
     # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
