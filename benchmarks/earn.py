@@ -4,7 +4,8 @@ The whole model, then the same with each part left out, on mannequins and on rea
 and LPIPS of the person, PSNR of face and hands, and processor seconds of training. A second seed of the whole
 model says how large a difference must be to mean anything. With ``--json FILE`` what the file holds is not
 computed again, so that an interrupted benchmark goes on where it was. Small sizes (no subdivision, few
-iterations, small pictures): a part that needs a long run to pay shows less here than it is worth.
+iterations, small pictures): a part that needs a long run to pay shows less here than it is worth. With
+``--long`` the sizes are those of the quick preset, one run as long as the main job's training.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ BASE = {
     "train.held_out_frames": "0",
 }
 """The quick preset with every term of the paper's objective, small, without subdivision."""
+
+LONG = {"auxiliary.generator": "off", "train.held_out_frames": "0"}
+"""The quick preset as it is; the generated views and the curve left out."""
 
 PARTS: Mapping[str, Mapping[str, str]] = {
     "pose heads": {"train.pose_heads_from": "1"},
@@ -134,8 +138,9 @@ def main(arguments: list[str] | None = None) -> None:
         prepare("benchmarks.earn", 1)
     subjects = options.subjects or (MANNEQUINS[2:] if options.quick else (*MANNEQUINS, *REAL))
     variants = options.variants or (QUICK if options.quick else tuple(VARIANTS))
-    words = {**BASE, **({"train.iterations": "40"} if options.quick else {})}
-    sizes = f"{words['train.iterations']} iterations, no subdivision, {words['ingest.long_side']} px"
+    words = LONG if options.long else {**BASE, **({"train.iterations": "40"} if options.quick else {})}
+    small = f"{words.get('train.iterations')} iterations, no subdivision, {words.get('ingest.long_side')} px"
+    sizes = "the quick preset's sizes" if options.long else small
     print(f"{described()}; {sizes}")
     table: Table = _read(options.json)
     for variant in dict.fromkeys((WHOLE, *variants)):
@@ -155,6 +160,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.earn", description="What each part earns.")
     parser.add_argument("--quick", action="store_true", help="one mannequin, two parts, 40 iterations")
+    parser.add_argument("--long", action="store_true", help="the quick preset's sizes")
     parser.add_argument("--subjects", nargs="+", metavar="NAME", help="whose avatars")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), metavar="NAME", help="which parts")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write crops of face and hands there")
