@@ -29,9 +29,9 @@ texture_frames = 3
 texture_levels = 0
 texture_guidance = false
 [train]
-iterations = 60
-checkpoint_every = 4
-held_out_every = 20
+iterations = 12
+checkpoint_every = 1
+held_out_every = 6
 held_out_frames = 1
 subdivisions = 0
 plane_resolution = 16
@@ -41,7 +41,7 @@ groups = 4
 residual_width = 16
 color_frames = 3
 gate_from = 0.25
-gate_every = 5
+gate_every = 2
 [evaluate]
 turntable_frames = 4
 turntable_width = 64
