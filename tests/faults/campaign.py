@@ -94,19 +94,25 @@ def plan(stages: tuple[str, ...], seed: int, moments: tuple[str, ...] = MOMENTS)
 
 
 def undisturbed(project: Project, keep: Path) -> Reference:
-    """Runs the subject once, keeps a copy of its store and clears it.
+    """Runs the subject twice, keeps a copy of the second store and clears it.
+
+    Twice, for the first may compile kernels, and because equal runs must give equal bytes to begin with.
 
     Raises:
-        RuntimeError: the run failed; what follows would say nothing.
+        RuntimeError: a run failed, or they differ; what follows would say nothing.
     """
-    run = Run(project)
-    status = run.finish()
-    if status:
-        raise RuntimeError(f"the undisturbed run failed:\n{run.text()}")
-    reference = Reference(published(project), run.durations(), keep)
+    found = []
+    for _ in range(2):
+        shutil.rmtree(project.artifacts, ignore_errors=True)
+        run = Run(project)
+        if run.finish():
+            raise RuntimeError(f"the undisturbed run failed:\n{run.text()}")
+        found.append(published(project))
     shutil.copytree(project.artifacts, keep, symlinks=True)
     shutil.rmtree(project.artifacts)
-    return reference
+    if names := differences(*found):
+        raise RuntimeError(f"two undisturbed runs differ in {', '.join(names)}")
+    return Reference(found[-1], run.durations(), keep)
 
 
 class Campaign:
