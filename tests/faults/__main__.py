@@ -25,9 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     kills = 14 if options.quick else options.kills
     keep = Path(tempfile.mkdtemp(prefix="flexiavatar-faults-"))
     project = real_project(keep / "project", options.assets.resolve())
-    print(
-        f"faults: {kills} kills, seed {options.seed}; first two runs that nothing disturbs, about two minutes"
-    )
+    print(f"faults: {kills} kills, seed {options.seed}; first two undisturbed runs, about two minutes")
     sys.stdout.flush()
     reference = undisturbed(project, keep / "reference")
     shown = ", ".join(f"{name or 'doit'} {seconds:.1f}" for name, seconds in reference.seconds.items())
