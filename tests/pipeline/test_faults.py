@@ -1,4 +1,4 @@
-"""What the machine can do to a run: kill it, run twice at once, fill up, refuse to be written, set its clock back."""
+"""What can happen to a run: it is killed, runs twice at once, finds its clock set back."""
 
 import json
 import os
@@ -97,13 +97,10 @@ def test_a_run_killed_between_publishing_and_latest_is_put_right_by_the_same_com
 def test_a_subject_that_the_system_kills_does_not_stop_the_others(toy):
     toy.subject("cat", '[source]\npath = "sources/ann.txt"\n[bend]\nfail = "killed"\n')
     run = toy.doit("subject=cat,bob")
-    assert run.returncode == 1 and "paint:bob" in toy.ran()
+    assert run.returncode != 0 and "paint:bob" in toy.ran()
     last = run.stdout.strip().splitlines()[-3:]
     assert last[0] == "1 of 2 subjects done, 1 failed" and last[2].split() == ["bob", "done"]
-    assert (
-        "cat  failed at bend: killed by signal 9 (SIGKILL), often the system's when memory runs out"
-        in last[1]
-    )
+    assert "cat  failed at bend: killed by signal 9 (SIGKILL)" in last[1] and "memory runs out" in last[1]
 
 
 def test_memory_that_runs_out_in_a_stage_is_one_line(toy):
