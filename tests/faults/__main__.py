@@ -14,7 +14,17 @@ import tempfile
 from pathlib import Path
 
 from pipeline.workspace import REPOSITORY
-from tests.faults.campaign import A_STAGE, CORRUPT, DIFFERENT, MANUAL, ORPHAN, Campaign, Tally, undisturbed
+from tests.faults.campaign import (
+    A_STAGE,
+    CORRUPT,
+    DIFFERENT,
+    MANUAL,
+    ORPHAN,
+    UNNOTICED,
+    Campaign,
+    Tally,
+    undisturbed,
+)  # fmt: skip
 from tests.faults.observe import PHASES, SHOWS_TIMES
 from tests.faults.project import real_project
 
@@ -76,6 +86,8 @@ def report(tally: Tally, seed: int, stages: tuple[str, ...]) -> list[str]:
         f"processes that outlived their parent: {tally.count(ORPHAN)}",
         f"files with other bytes: {tally.count(DIFFERENT)} (not compared: run.json, and "
         f"{', '.join(SHOWS_TIMES)}, which show how long things took)",
+        f"bits flipped in files of every kind: {tally.flipped}, not found: {tally.count(UNNOTICED)}; "
+        "then one in every stage, and all made again by one command",
         f"left behind, hidden: {dict(tally.left) or 'nothing'}",
         f"seconds: {tally.seconds:.0f} ({A_STAGE} kills a stage between two whole runs)",
         *(f"FAILED: {failure}" for failure in tally.failures),
@@ -89,7 +101,8 @@ def headline(tally: Tally) -> str:
     return (
         f"faults: {kills} kills, {tally.runs} whole runs compared byte for byte: "
         f"{tally.count(CORRUPT)} corrupt, {tally.count(MANUAL)} manual steps, "
-        f"{tally.count(DIFFERENT)} files different, {tally.count(ORPHAN)} orphans"
+        f"{tally.count(DIFFERENT)} files different, {tally.count(ORPHAN)} orphans; "
+        f"{tally.flipped} flipped bits, {tally.count(UNNOTICED)} unnoticed"
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.stage import Progress
+from tests.faults.flips import damage_every_stage, unnoticed
 from tests.faults.observe import differences, litter, phase, published, wrongs
 from tests.faults.project import Project
 from tests.faults.runs import MOMENTS, TARGETS, Kill, Run
@@ -34,6 +35,7 @@ class Tally:
         missed: kills for which the run was over too soon.
         failures: what went wrong, in words; each begins with one of ``KINDS``.
         left: what finished runs left behind, hidden and harmless.
+        flipped: bits that were flipped in finished results, a file of each kind.
         seconds: of all of it.
     """
 
@@ -44,6 +46,7 @@ class Tally:
     missed: int = 0
     failures: list[str] = dataclasses.field(default_factory=list)
     left: Counter[str] = dataclasses.field(default_factory=Counter)
+    flipped: int = 0
     seconds: float = 0.0
 
     def count(self, kind: str) -> int:
@@ -57,7 +60,8 @@ class Tally:
 
 
 CORRUPT, MANUAL, DIFFERENT, ORPHAN = "corrupt", "manual step", "different bytes", "orphan"
-KINDS = (CORRUPT, MANUAL, DIFFERENT, ORPHAN)
+UNNOTICED = "unnoticed"
+KINDS = (CORRUPT, MANUAL, DIFFERENT, ORPHAN, UNNOTICED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,10 +124,10 @@ class Campaign:
 
     def __init__(self, project: Project, reference: Reference, kills: int, seed: int, keep: Path):
         self.project, self.reference, self.kills, self.keep = project, reference, kills, keep
-        self.plan, self.tally = plan(project.stages, seed), Tally()
+        self.plan, self.tally, self.draw = plan(project.stages, seed), Tally(), random.Random(seed)
 
     def run(self) -> Tally:
-        """All kills, then one run that is let through."""
+        """All kills and one run that is let through, then flipped bits."""
         start = time.monotonic()
         progress = Progress(self.kills, "faults")
         while sum(self.tally.kills.values()) < self.kills:
@@ -134,8 +138,8 @@ class Campaign:
                 note = f"{self.tally.runs} whole runs compared, {len(self.tally.failures)} failures"
                 progress.advance(1, note)
         self.through(Run(self.project))
-        self.verify()
         progress.close()
+        self.flips()
         self.tally.seconds = time.monotonic() - start
         return self.tally
 
@@ -184,12 +188,27 @@ class Campaign:
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(made, copy)
 
-    def verify(self) -> None:
-        """Makes the subject once more and lets ``doit run verify`` read it."""
-        for tasks in ((), (f"verify:{self.project.subject}",)):
-            run = Run(self.project, *tasks)
-            if run.finish():
-                self.fail(CORRUPT, f"doit run {' '.join(tasks)} failed", run)
+    def flips(self) -> None:
+        """Flips bits in finished results: each is found, and one command makes all that is damaged again."""
+        self.expect(Run(self.project), 0)
+        self.expect(Run(self.project, f"verify:{self.project.subject}"), 0)
+        self.tally.flipped, missed = unnoticed(self.project, self.draw)
+        damage_every_stage(self.project, self.draw)
+        run = Run(self.project, f"verify:{self.project.subject}")
+        self.expect(run, 1)
+        missed += [
+            stage
+            for stage in self.project.stages
+            if f"rerun the stage: doit run {stage}:{self.project.subject}" not in run.text()
+        ]
+        for kind in missed:
+            self.fail(UNNOTICED, f"a flipped bit in {kind}", run)
+        self.through(Run(dataclasses.replace(self.project, words=(*self.project.words, "verify=true"))))
+
+    def expect(self, run: Run, status: int) -> None:
+        """Notes a run that does not end with this status."""
+        if run.finish() != status:
+            self.fail(MANUAL, f"{' '.join(run.project.words)} ended with {run.process.returncode}", run)
 
     def note(self, run: Run) -> None:
         """Counts what a run said of going on."""
