@@ -6,11 +6,16 @@ import os
 import shutil
 import subprocess
 
+import numpy as np
+import pyarrow as pa
 import pytest
+from safetensors.numpy import save_file
 
 from pipeline.artifact import Store
 from pipeline.explain import explain, is_disk_full, size
+from pipeline.frames import write_png
 from pipeline.job import job_from_words, run_stage
+from pipeline.tables import write_table
 from pipeline.verify import damages
 
 STAGES = ("gather", "bend", "paint")
@@ -168,3 +173,22 @@ def test_a_finished_store_can_be_read_where_it_cannot_be_written(toy):
         run = toy.doit("subject=ann", "bend.angle=9")
         assert run.returncode != 0 and "cannot be written" in run.stderr and str(toy.store) in run.stderr
         assert "Traceback" not in run.stdout + run.stderr
+
+
+def write_picture(path):
+    write_png(path, np.random.default_rng(0).integers(0, 255, (300, 300, 3)).astype(np.uint8))
+
+
+def write_numbers(path):
+    write_table(path, pa.schema([("a", pa.float64())]), {"a": np.random.default_rng(0).random(90_000)})
+
+
+def write_arrays(path):
+    save_file({"a": np.ones(90_000)}, path)
+
+
+@pytest.mark.parametrize("write", [write_picture, write_numbers, write_arrays])
+def test_every_library_that_writes_says_that_the_disk_is_full(small_disk, write):
+    with pytest.raises(Exception) as caught:
+        write(small_disk / "file")
+    assert "the disk is full" in explain(caught.value, small_disk)
