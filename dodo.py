@@ -10,7 +10,7 @@
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
 
-What is stale is decided by the store (``pipeline.job``), never by doit's own database, which may be lost.
+What is stale is decided by the store (``pipeline.job``), never by doit's own database, which is not kept.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ import sys
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
 from pipeline import assets as third_party
-from pipeline.artifact import Store, verify
+from pipeline.artifact import Store
 from pipeline.datasets import known_datasets, subjects_of
 from pipeline.errors import UserError
-from pipeline.job import Job, check_command_line, job_from_words, shown, workspace_from_words
+from pipeline.job import Job, check_command_line, job_from_words, shown, wanted_keys, workspace_from_words
 from pipeline.process import run_stage_process
 from pipeline.stage import load_stages
 from pipeline.subjects import known_subjects, load_subject
 from pipeline.summary import summarising
+from pipeline.verify import verify
 
 DEFAULT_SUBJECT = "smile"
 
@@ -77,8 +78,10 @@ LAST = list(STAGES)[-1]
 
 DOIT_CONFIG = {
     "default_tasks": [f"{LAST}:{subject}" for subject in CHOSEN],
-    "backend": "json",
-    "dep_file": str(WORKSPACE.data.parent / ".doit.json"),
+    # doit's database lives as long as the run: on disk it would be one more file that a kill, a full disk or
+    # a second run at the same time can leave half-written, and doit then asks for it to be deleted.
+    "backend": "sqlite3",
+    "dep_file": ":memory:",
     "verbosity": 2,
     "reporter": summarising(CHOSEN, list(STAGES)),
     "continue": True,
@@ -105,7 +108,7 @@ def is_current(stage: str, subject: str) -> bool:
     """Whether the store holds the stage's result; what is wrong is left for the stage to report."""
     try:
         return job_of(subject).is_current(stage)
-    except UserError:
+    except (UserError, OSError):
         return False
 
 
@@ -164,8 +167,10 @@ def fetch_asset(name: str) -> TaskFailed | None:
     """Fetches one asset, with pip's progress on this terminal."""
     try:
         third_party.fetch(WORKSPACE, third_party.find_asset(WORKSPACE, name))
-    except (UserError, OSError) as error:
+    except UserError as error:
         return TaskFailed(str(error))
+    except OSError as error:
+        return TaskFailed(f"{WORKSPACE.assets}: {error}; choose another folder: assets=FOLDER")
     return None
 
 
@@ -183,13 +188,20 @@ def task_assets():
 def verify_subject(subject: str) -> TaskFailed | None:
     """Reads every byte of a subject's versions."""
     store = Store(WORKSPACE.artifacts)
-    artifacts = [artifact for stage in STAGES for artifact in store.versions(subject, stage)]
     try:
-        verify(artifacts)
+        count = verify(store, subject, STAGES, words_of(subject), wanted(subject))
     except UserError as error:
         return TaskFailed(str(error))
-    print(f"{subject}: {len(artifacts)} version(s) whole")
+    print(f"{subject}: {count} version(s) whole")
     return None
+
+
+def wanted(subject: str) -> dict[str, str]:
+    """The keys of the versions that the command line calls for, as far as they can be told."""
+    try:
+        return wanted_keys(job_of(subject))
+    except UserError:
+        return {}
 
 
 def task_verify():

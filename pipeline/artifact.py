@@ -12,20 +12,24 @@ import dataclasses
 import fnmatch
 import json
 import os
+import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import filelock
 
-from pipeline import digest
+from pipeline import digest, seal
 from pipeline.errors import UserError
+from pipeline.explain import is_disk_full
 
 MANIFEST = "manifest.json"
 RUN = "run.json"
 LATEST = "latest"
 SCRATCH = ".scratch-"
+LOCK = ".lock-"
+DAMAGED = ".damaged-"
 KEY_LENGTH = 16
 
 
@@ -70,22 +74,32 @@ class Scratch:
 
 @dataclasses.dataclass(frozen=True)
 class Store:
-    """All versions of all subjects under one folder."""
+    """All versions of all subjects under one folder.
+
+    Attributes:
+        root: the folder.
+        thorough: believe a version only after reading every byte of it, not its sizes alone.
+    """
 
     root: Path
+    thorough: bool = False
 
     def folder(self, subject: str, stage: str) -> Path:
         """Where the versions of one stage of one subject lie."""
         return self.root / subject / stage
 
     def find(self, subject: str, stage: str, key: str) -> Artifact | None:
-        """The version with this key, or None if it is absent, incomplete or of the wrong size."""
+        """The version with this key, or None if it is absent, incomplete or damaged.
+
+        Damaged is what has the wrong size, and in a thorough store what has the wrong content.
+        """
         folder = self.folder(subject, stage) / key
         manifest = read_manifest(folder)
-        if manifest is None or manifest.get("key") != key:
+        if manifest is None or manifest["key"] != key:
             return None
         artifact = Artifact(folder, manifest)
-        return artifact if not wrong_sizes(artifact) else None
+        wrong = damaged_files(artifact) if self.thorough else wrong_sizes(artifact)
+        return artifact if not wrong else None
 
     def latest(self, subject: str, stage: str) -> Artifact | None:
         """The version in use, or None."""
@@ -94,22 +108,37 @@ class Store:
 
     def versions(self, subject: str, stage: str) -> list[Artifact]:
         """Every whole version of one stage, by key."""
-        folder = self.folder(subject, stage)
-        names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
-        found = (
-            self.find(subject, stage, name) for name in names if not name.startswith(".") and name != LATEST
-        )
+        found = (self.find(subject, stage, folder.name) for folder in self.folders(subject, stage))
         return [artifact for artifact in found if artifact is not None]
 
+    def folders(self, subject: str, stage: str) -> list[Path]:
+        """The folder of every version of one stage, whole or damaged, by key."""
+        folder = self.folder(subject, stage)
+        entries = sorted(folder.iterdir()) if folder.is_dir() else []
+        return [entry for entry in entries if not entry.name.startswith(".") and entry.name != LATEST]
+
     def select(self, artifact: Artifact) -> None:
-        """Points ``latest`` at this version, in one step."""
+        """Points ``latest`` at this version, in one step.
+
+        Raises:
+            UserError: something else is in the link's place.
+        """
         link = artifact.folder.parent / LATEST
         if link.is_symlink() and os.readlink(link) == artifact.folder.name:
             return
-        fresh = link.with_name(f".{LATEST}-{os.getpid()}")
-        fresh.unlink(missing_ok=True)
+        if link.exists() and not link.is_symlink():
+            raise UserError(f"{link}: is not a link (was the store copied without links?); delete it")
+        fresh = link.with_name(f".{LATEST}-{secrets.token_hex(4)}")
         fresh.symlink_to(artifact.folder.name)
         os.replace(fresh, link)
+
+    def settle(self, artifact: Artifact) -> None:
+        """Points ``latest`` at this version, and clears what a run killed after publishing it left."""
+        self.select(artifact)
+        if not leftovers(artifact.folder):
+            return
+        with contextlib.suppress(OSError, filelock.Timeout), lock_of(artifact.folder).acquire(timeout=0):
+            clear(leftovers(artifact.folder))
 
     @contextlib.contextmanager
     def scratch(self, subject: str, stage: str, key: str, on_wait: Callable[[], None]) -> Iterator[Scratch]:
@@ -120,7 +149,7 @@ class Store:
         """
         folder = self.folder(subject, stage) / f"{SCRATCH}{key}"
         make_folder(folder.parent)
-        lock = filelock.FileLock(folder.with_name(f".lock-{key}"))
+        lock = lock_of(folder.with_name(key))
         try:
             lock.acquire(timeout=0)
         except filelock.Timeout:
@@ -132,6 +161,10 @@ class Store:
             make_folder(scratch.output)
             make_folder(scratch.work)
             yield scratch
+        except BaseException as error:
+            if is_disk_full(error):  # half a result is of no use, and its room is wanted
+                shutil.rmtree(scratch.output, ignore_errors=True)
+            raise
         finally:
             lock.release()
 
@@ -158,15 +191,16 @@ class Store:
         manifest = {**description, "key": key, "files": files}
         write_json(scratch.output / RUN, run)
         write_json(scratch.output / MANIFEST, manifest)
+        seal.write_seal(scratch.output, (MANIFEST, RUN))
         flush_tree(scratch.output)
         target = self.folder(subject, stage) / key
-        if target.exists():
-            set_aside(target)
+        if target.exists():  # it is damaged, or this would not have been made again
+            os.rename(target, target.with_name(f"{DAMAGED}{key}-{secrets.token_hex(4)}"))
         os.rename(scratch.output, target)
         flush(target.parent)
-        shutil.rmtree(scratch.output.parent, ignore_errors=True)
         artifact = Artifact(target, manifest)
         self.select(artifact)
+        clear(leftovers(target))
         return artifact
 
     def prune(self, subject: str, stage: str) -> list[Path]:
@@ -176,21 +210,41 @@ class Store:
         used = link.resolve() if link.is_symlink() else None
         gone = []
         for entry in sorted(folder.iterdir()) if folder.is_dir() else []:
-            if entry.name == LATEST or entry.resolve() == used or in_use(entry):
+            if entry.name == LATEST or (entry.resolve() == used and not entry.is_symlink()) or in_use(entry):
                 continue
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            clear([entry])
             gone.append(entry)
         return gone
 
 
+def lock_of(version: Path) -> filelock.BaseFileLock:
+    """The lock that whoever makes this version holds."""
+    return filelock.FileLock(version.with_name(f"{LOCK}{version.name}"))
+
+
+def leftovers(version: Path) -> list[Path]:
+    """What runs that were killed while they published this version left beside it."""
+    parent, key = version.parent, version.name
+    scratch = parent / f"{SCRATCH}{key}"
+    return [*([scratch] if scratch.exists() else []), *parent.glob(f"{DAMAGED}{key}-*")]
+
+
+def clear(entries: Sequence[Path]) -> None:
+    """Deletes folders, files and links."""
+    for entry in entries:
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
+
+
 def in_use(entry: Path) -> bool:
     """Whether a running process holds the lock of this scratch folder, or this lock."""
-    key = entry.name.removeprefix(SCRATCH).removeprefix(".lock-")
-    path = entry.with_name(f".lock-{key}")
-    if not path.exists():
+    version = entry.with_name(entry.name.removeprefix(SCRATCH).removeprefix(LOCK))
+    if not version.with_name(f"{LOCK}{version.name}").exists():
         return False
     try:
-        with filelock.FileLock(path).acquire(timeout=0):
+        with lock_of(version).acquire(timeout=0):
             return False
     except filelock.Timeout:
         return True
@@ -202,7 +256,21 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return manifest if isinstance(manifest, dict) and isinstance(manifest.get("files"), list) else None
+    return manifest if isinstance(manifest, dict) and is_manifest(manifest) else None
+
+
+def is_manifest(manifest: Mapping[str, Any]) -> bool:
+    """Whether a key and the files are there as they should be."""
+    fields = {"path": str, "size": int, "sha256": str}
+    files = manifest.get("files")
+    return (
+        isinstance(manifest.get("key"), str)
+        and isinstance(files, list)
+        and all(
+            isinstance(file, dict) and all(isinstance(file.get(name), kind) for name, kind in fields.items())
+            for file in files
+        )
+    )
 
 
 def wrong_sizes(artifact: Artifact) -> list[str]:
@@ -217,27 +285,23 @@ def wrong_sizes(artifact: Artifact) -> list[str]:
 def wrong_digests(artifact: Artifact) -> list[str]:
     """The files of a version whose content is not what its manifest says; reads every byte."""
     wrong = set(wrong_sizes(artifact))
-    whole = (file for file in artifact.manifest["files"] if file["path"] not in wrong)
-    return sorted(
-        wrong
-        | {file["path"] for file in whole if digest.of_file(artifact.folder / file["path"]) != file["sha256"]}
-    )
+    for file in artifact.manifest["files"]:
+        if file["path"] not in wrong and digest_of(artifact.folder / file["path"]) != file["sha256"]:
+            wrong.add(file["path"])
+    return sorted(wrong)
 
 
-def verify(artifacts: Iterable[Artifact]) -> None:
-    """Reads every byte of the versions.
+def damaged_files(artifact: Artifact) -> list[str]:
+    """The files of a version, its own records included, that are not as they were published."""
+    return [*seal.broken(artifact.folder, (MANIFEST, RUN)), *wrong_digests(artifact)]
 
-    Raises:
-        UserError: a file is damaged; names it and the stage to rerun.
-    """
-    for artifact in artifacts:
-        damaged = wrong_digests(artifact)
-        if damaged:
-            stage, subject = artifact.folder.parent.name, artifact.folder.parent.parent.name
-            raise UserError(
-                f"{artifact.folder / damaged[0]}: damaged ({len(damaged)} file(s) of this version); "
-                f"delete {artifact.folder} and rerun the stage: doit run {stage}:{subject}"
-            )
+
+def digest_of(path: Path) -> str:
+    """A file's digest; empty where the disk does not give its bytes."""
+    try:
+        return digest.of_file(path)
+    except OSError:
+        return ""
 
 
 def size_of(path: Path) -> int:
@@ -274,13 +338,6 @@ def make_folder(folder: Path) -> None:
         raise UserError(
             f"{folder}: cannot be made ({error.strerror}); choose another store: artifacts=FOLDER"
         ) from error
-
-
-def set_aside(folder: Path) -> None:
-    """Moves a damaged version out of the way under a name that no reader looks at, then deletes it."""
-    aside = folder.with_name(f".damaged-{folder.name}-{os.getpid()}")
-    os.rename(folder, aside)
-    shutil.rmtree(aside, ignore_errors=True)
 
 
 def flush_tree(folder: Path) -> None:

@@ -131,6 +131,8 @@ def fetch(workspace: Workspace, asset: Asset) -> Path:
         UserError: it cannot be had, or its hash is wrong; names the file and where to put it.
     """
     folder = workspace.assets / asset.name
+    if is_ready(workspace, asset):  # also where the folder cannot be written
+        return folder
     workspace.assets.mkdir(parents=True, exist_ok=True)
     with filelock.FileLock(workspace.assets / f".{asset.name}.lock"):
         if is_ready(workspace, asset):

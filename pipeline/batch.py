@@ -97,7 +97,7 @@ def is_current(job: Job, stage: str) -> bool:
     """Whether the store holds the stage's result; what is wrong is left for the stage to report."""
     try:
         return job.is_current(stage)
-    except UserError:
+    except (UserError, OSError):
         return False
 
 

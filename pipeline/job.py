@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import importlib
@@ -15,16 +16,16 @@ from typing import Any
 
 from pipeline import assets as third_party
 from pipeline import digest
-from pipeline.artifact import Artifact, Store
+from pipeline.artifact import Artifact, Store, clear
 from pipeline.errors import UserError
-from pipeline.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
+from pipeline.settings import Layer, as_dict, command_line_layer, convert, near, read_toml, resolve
 from pipeline.stage import Context, Stage, load_stages
 from pipeline.subjects import Subject, load_subject, require_footage
 from pipeline.workspace import Workspace, open_workspace
 
 # Words of the command line that are no stage's settings.
 PLACES = ("data", "artifacts", "assets", "body", "stages")
-WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", *PLACES)
+WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", "verify", *PLACES)
 NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
 DEFAULT_PRESET = "quick"
 
@@ -41,6 +42,7 @@ class Job:
         subject: who, and the footage.
         settings: stage name -> its settings object.
         words: the command line that says all this, for starting a stage's process.
+        thorough: believe no version in the store before all of it was read.
     """
 
     workspace: Workspace
@@ -48,10 +50,11 @@ class Job:
     subject: Subject
     settings: Mapping[str, Any]
     words: tuple[str, ...]
+    thorough: bool = False
 
     @property
     def store(self) -> Store:
-        return Store(self.workspace.artifacts)
+        return Store(self.workspace.artifacts, self.thorough)
 
     @functools.cached_property
     def source_digest(self) -> str:
@@ -122,7 +125,7 @@ class Job:
         """Whether nothing needs to run; if so, ``latest`` is pointed at the result."""
         artifact = self.find(name)
         if artifact is not None:
-            self.store.select(artifact)
+            self.store.settle(artifact)
         return artifact is not None
 
     def needed_assets(self, name: str) -> list[str]:
@@ -135,6 +138,15 @@ class Job:
 def key_of(description: Mapping[str, Any]) -> str:
     """The key of a version: a digest of what it is made from."""
     return digest.of_json(description)[:16]
+
+
+def wanted_keys(job: Job) -> dict[str, str]:
+    """The key that each stage's result has under the present settings, where its inputs are in the store."""
+    keys = {}
+    for name in job.stages:
+        with contextlib.suppress(UserError):
+            keys[name] = key_of(job.description(name))
+    return keys
 
 
 def words_to_dict(words: Iterable[str]) -> dict[str, str]:
@@ -193,6 +205,14 @@ def setting_layers(workspace: Workspace, words: Mapping[str, str], subject: Subj
     return [*layers, *(subject.layers if subject else ()), command_line_layer(overrides)]
 
 
+def is_thorough(words: Mapping[str, str]) -> bool:
+    """What ``verify=`` says; false where it is not there."""
+    try:
+        return bool(convert(words.get("verify", "false"), bool))
+    except ValueError:
+        raise UserError(f"verify={words['verify']}: it must be true or false") from None
+
+
 def workspace_from_words(words: Mapping[str, str]) -> Workspace:
     """The workspace that the command line names, or this checkout's."""
     return open_workspace(**{place: words[place] for place in PLACES if place in words})
@@ -207,6 +227,7 @@ def check_command_line(words: Mapping[str, str]) -> None:
     workspace = workspace_from_words(words)
     stages = load_stages(workspace.stages)
     check_words(words, stages)
+    is_thorough(words)
     resolve({name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, None))
 
 
@@ -224,7 +245,7 @@ def job_from_words(subject: str, words: Mapping[str, str]) -> Job:
         {name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, who)
     )
     passed = tuple(f"{name}={value}" for name, value in words.items() if name != "subject")
-    return Job(workspace, stages, who, settings, passed)
+    return Job(workspace, stages, who, settings, passed, is_thorough(words))
 
 
 def run_stage(job: Job, name: str) -> Artifact:
@@ -244,6 +265,7 @@ def run_stage(job: Job, name: str) -> Artifact:
         already = job.store.find(subject, name, key)
         if already is not None:
             job.store.select(already)
+            clear([scratch.output.parent])
             return already
         stage, demands = job.stages[name], job.stages[name].demands(job.settings[name])
         upstream = {other: job.find(other) for other in stage.needs}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
+import os
 import signal
 import subprocess
 import sys
@@ -32,17 +34,31 @@ def run_stage_process(stage: str, subject: str, words: Mapping[str, str]) -> str
         reason = Path(folder) / "reason"
         environment = {**process_environment(), REASON: str(reason)}
         command = stage_command(stage, subject, words)
-        prepare = _end_with_parent if sys.platform == "linux" else None
+        prepare = functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
         status = subprocess.run(command, env=environment, check=False, preexec_fn=prepare).returncode
         said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
     if status < 0:
-        return f"killed by signal {-status}; the same command goes on from here"
+        return killed_by(-status)
     if status:
         return said or f"stopped with status {status}; its own lines above say why"
     return None
 
 
-def _end_with_parent() -> None:
+def killed_by(number: int) -> str:
+    """Why a process ended that a signal ended."""
+    try:
+        name = f" ({signal.Signals(number).name})"
+    except ValueError:
+        name = ""
+    likely = ""
+    if name == " (SIGKILL)":
+        likely = ", often the system's when memory runs out: run fewer subjects at once or a smaller preset"
+    return f"killed by signal {number}{name}{likely}; the same command goes on from here"
+
+
+def _end_with(parent: int) -> None:
     """Lets the kernel end this process if the one that started it is killed."""
     with contextlib.suppress(OSError, AttributeError):  # a C library without it
         ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGTERM)
+        if os.getppid() != parent:  # it was killed before the kernel knew
+            os._exit(1)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import errno
 import importlib
 import os
 import pkgutil
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.explain import explain
 from pipeline.settings import near
 
 
@@ -201,20 +201,6 @@ class Context:
     def timing(self, name: str, value: Any) -> None:
         """Notes something that differs between two equal runs (seconds, memory), for run.json."""
         self.timings[name] = value
-
-
-def explain(error: Exception, where: Path) -> str | None:
-    """The one line that a user is shown for this error, or None if it is a defect of ours."""
-    if isinstance(error, UserError):
-        return str(error)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return (
-            f"{error.filename or where}: the disk is full; free some space or choose another store "
-            "(artifacts=FOLDER), then run the same command again"
-        )
-    if isinstance(error, PermissionError):
-        return f"{error.filename or where}: no permission to write; choose another store: artifacts=FOLDER"
-    return None
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

@@ -37,6 +37,7 @@ class Checkpoint:
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Puts a checkpoint in place of the one before, whole or not at all."""
     header = {"iteration": checkpoint.iteration, "key": checkpoint.key, "extra": checkpoint.extra}
+    header["sha256"] = digest_of(header, checkpoint.tensors)
     partial = folder / f"{NAME}.partial"
     with partial.open("wb") as file:
         file.write(save(checkpoint.tensors, {"checkpoint": json.dumps(header)}))
@@ -46,16 +47,28 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(folder: Path, key: str) -> Checkpoint | None:
-    """The run's last checkpoint; None if there is none, it is unreadable or another run's."""
+    """The run's last checkpoint; None if there is none, it is damaged in any bit or another run's."""
     try:
         with safetensors.safe_open(folder / NAME, "pt") as file:
             header = json.loads((file.metadata() or {})["checkpoint"])
+            sealed = header.pop("sha256")
             if header["key"] != key:
                 return None
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, KeyError, safetensors.SafetensorError):
+            if sealed != digest_of(header, tensors):
+                return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, safetensors.SafetensorError):
         return None
     return Checkpoint(header["iteration"], key, tensors, header["extra"])
+
+
+def digest_of(header: dict, tensors: dict[str, Tensor]) -> str:
+    """A digest of a checkpoint's JSON values, and its tensors by name, type, shape and content."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
 
 
 def run_key(settings: dict, arrays: Iterable[Tensor]) -> str:

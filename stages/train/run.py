@@ -22,7 +22,7 @@ from pipeline.records import Split, read_cameras, read_footage, read_split
 from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
-from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
+from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.costs import saved
 from stages.train.data import Frames, spread
 from stages.train.gate import Gate, write_ungated
@@ -244,6 +244,8 @@ def resume(trainer: Trainer, work: Path, key: str, context: Context) -> None:
     if checkpoint is not None:
         trainer.resume(checkpoint)
         context.log(f"goes on from iteration {checkpoint.iteration}")
+    elif (work / NAME).exists():
+        context.log("the checkpoint of a killed run is damaged, or of other inputs: training begins anew")
 
 
 def report(iteration: int, values: dict[str, float], held_out: float | None, context: Context) -> None:

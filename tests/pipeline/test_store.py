@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from pipeline.artifact import Store, verify, wrong_digests, wrong_sizes
+from pipeline.artifact import Store, wrong_digests, wrong_sizes
 from pipeline.errors import UserError
+from pipeline.verify import verify
 
 
 def publish(store, key="k1", text="one", stage="fit"):
@@ -68,12 +69,13 @@ def test_a_missing_or_broken_manifest_makes_the_version_unusable(tmp_path):
 
 
 def test_verify_reads_every_byte(tmp_path):
-    made = publish(Store(tmp_path))
-    verify([made])
+    store = Store(tmp_path)
+    made = publish(store)
+    assert verify(store, "ann", ["fit"]) == 1
     (made.folder / "b.txt").write_text("c")
     assert wrong_sizes(made) == [] and wrong_digests(made) == ["b.txt"]
     with pytest.raises(UserError, match="doit run fit:ann"):
-        verify([made])
+        verify(store, "ann", ["fit"])
 
 
 def test_a_store_that_cannot_be_made_names_itself(tmp_path):

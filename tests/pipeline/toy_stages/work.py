@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -32,6 +33,10 @@ def bend(context):
         raise ZeroDivisionError("ours")
     if fail == "disk":
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(context.output / "half.txt"))
+    if fail == "memory":
+        raise MemoryError
+    if fail == "killed":  # as the system does when memory is short
+        os.kill(os.getpid(), signal.SIGKILL)
     text = (context.inputs["gather"] / "text.txt").read_text()
     (context.output / "bent.txt").write_text(f"{text}{context.settings.angle}")
 
@@ -46,7 +51,9 @@ def paint(context):
     with context.progress(context.settings.iterations, "painting") as progress:
         while done < context.settings.iterations:
             done += 1
-            checkpoint.write_text(str(done))
+            partial = checkpoint.with_suffix(".partial")
+            partial.write_text(str(done))
+            partial.replace(checkpoint)
             progress.advance()
             if context.settings.rate:
                 time.sleep(context.settings.rate)

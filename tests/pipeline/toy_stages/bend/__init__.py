@@ -6,7 +6,7 @@ from pipeline.stage import Stage
 @dataclasses.dataclass(frozen=True)
 class BendSettings:
     angle: float = 1.0
-    fail: str = ""  # "user", "bug", "disk", "sleep"
+    fail: str = ""  # "user", "bug", "disk", "memory", "killed"
 
 
 STAGE = Stage("bend", 1, BendSettings, "tests.pipeline.toy_stages.work:bend", needs={"gather": ("text.txt",)})
