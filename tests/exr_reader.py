@@ -87,12 +87,10 @@ def _unzipped(block):
     return mixed.tobytes()
 
 
-def ffmpeg_colors(path, part):
-    """A part's RGB or XYZ as FFmpeg's own decoder reads it: [H, W, 3] float32."""
-    decoder = av.CodecContext.create("exr", "r")
-    decoder.options = {"part": str(part)}
-    frame = decoder.decode(av.Packet(path.read_bytes()))[0]
-    assert frame.format.name in ("gbrpf16le", "gbrapf16le")
+def ffmpeg_colors(path):
+    """The first part's RGB as FFmpeg's own decoder reads it: [H, W, 3] float32."""
+    frame = av.CodecContext.create("exr", "r").decode(av.Packet(path.read_bytes()))[0]
+    assert frame.format.name == "gbrapf16le"
     green, blue, red = (
         np.frombuffer(plane, "<f2").reshape(frame.height, -1)[:, : frame.width] for plane in frame.planes[:3]
     )
