@@ -80,7 +80,9 @@ def test_equal_images_give_equal_video(tmp_path: Path) -> None:
 def test_equal_images_give_equal_video_whatever_lies_in_memory(tmp_path: Path) -> None:
     rows, columns = np.mgrid[:64, :48]
     images = [
-        np.stack([128 + 90 * np.sin(columns / 5 + k), 128 + 90 * np.cos(rows / 7 + k), 2 * columns + rows], -1)
+        np.stack(
+            [128 + 90 * np.sin(columns / 5 + k), 128 + 90 * np.cos(rows / 7 + k), 2 * columns + rows], -1
+        )
         for k in range(5)
     ]
     generator, seen = np.random.default_rng(0), set()
