@@ -9,6 +9,7 @@
     doit run dataset=insta                      every subject of a dataset
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
+    doit run animate subject=oliver motion=dance.bvh    the avatar in a motion that nobody filmed
 
 What is stale is decided by the store (``pipeline.job``), never by doit's own database, which is not kept.
 """
@@ -27,7 +28,7 @@ from pipeline.datasets import known_datasets, subjects_of
 from pipeline.errors import UserError
 from pipeline.job import Job, check_command_line, job_from_words, shown, wanted_keys, workspace_from_words
 from pipeline.process import run_stage_process
-from pipeline.stage import load_stages
+from pipeline.stage import load_stages, usual
 from pipeline.subjects import known_subjects, load_subject
 from pipeline.summary import summarising
 from pipeline.verify import verify
@@ -74,10 +75,12 @@ WORKSPACE = workspace_from_words(WORDS)
 STAGES = load_stages(WORKSPACE.stages)
 CHOSEN = chosen_subjects(WORDS)
 SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN}))
-LAST = list(STAGES)[-1]
+ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
+# "doit clean" deletes what the default tasks made: all of it, also what is only made when asked for.
+DEFAULT = [usual(STAGES)[-1], *(ON_REQUEST if "clean" in sys.argv[1:2] else ())]
 
 DOIT_CONFIG = {
-    "default_tasks": [f"{LAST}:{subject}" for subject in CHOSEN],
+    "default_tasks": [f"{stage}:{subject}" for stage in DEFAULT for subject in CHOSEN],
     # doit's database lives as long as the run: on disk it would be one more file that a kill, a full disk or
     # a second run at the same time can leave half-written, and doit then asks for it to be deleted.
     "backend": "sqlite3",
@@ -126,6 +129,15 @@ def needed_assets(stage: str, subject: str) -> list[str]:
         return []  # the stage itself reports it
 
 
+def needed_of_others(stage: str, subject: str) -> list[str]:
+    """The tasks whose results of other subjects a stage reads."""
+    try:
+        loans = STAGES[stage].demands(job_of(subject).settings[stage]).loans
+    except UserError:
+        return []  # the stage itself reports it
+    return [f"{loan.stage}:{loan.subject}" for loan in loans if loan.subject in SUBJECTS]
+
+
 def remove_versions(stage: str, subject: str) -> None:
     """Deletes every version of one stage of one subject."""
     folder = Store(WORKSPACE.artifacts).folder(subject, stage)
@@ -142,6 +154,7 @@ def stage_task(stage: str, subject: str) -> dict:
         "task_dep": [
             *(f"{upstream}:{subject}" for upstream in STAGES[stage].needs),
             *(f"assets:{name}" for name in needed_assets(stage, subject)),
+            *needed_of_others(stage, subject),
         ],
         "uptodate": [functools.partial(is_current, stage, subject)],
         "actions": [(run_stage, [stage, subject])],
@@ -151,10 +164,13 @@ def stage_task(stage: str, subject: str) -> dict:
 
 def stage_tasks(stage: str):
     """A generator of one stage's tasks, as doit collects them."""
+    # "doit run animate subject=oliver" names the whole group; it is meant for the chosen subjects. Other
+    # stages keep the tasks of all subjects, which the stages after them name.
+    subjects = CHOSEN if stage in ON_REQUEST and stage in sys.argv[1:] else SUBJECTS
 
     def tasks():
         yield {"name": None, "doc": f"stage {stage}: a sub-task a subject"}
-        for subject in SUBJECTS:
+        for subject in subjects:
             yield stage_task(stage, subject)
 
     return tasks

@@ -27,7 +27,7 @@ from pipeline.errors import UserError
 from pipeline.job import DEFAULT_PRESET, PLACES, Job, job_from_words, preset_path, workspace_from_words
 from pipeline.process import run_stage_process
 from pipeline.settings import convert, read_toml
-from pipeline.stage import Stage
+from pipeline.stage import Stage, usual
 from pipeline.summary import Outcome, summary_lines
 from pipeline.workspace import REPOSITORY
 
@@ -87,7 +87,7 @@ def run_subject(subject: str, words: Mapping[str, str]) -> Outcome:
 
 def way(stages: Mapping[str, Stage]) -> list[str]:
     """The stages that the last one needs, upstream first, and itself: what ``doit run`` runs."""
-    wanted = {list(stages)[-1]}
+    wanted = {usual(stages)[-1]}
     for name in reversed(list(stages)):
         wanted.update(stages[name].needs if name in wanted else ())
     return [name for name in stages if name in wanted]
@@ -184,7 +184,7 @@ def fetch_assets(subjects: Sequence[str], words: Mapping[str, str]) -> None:
     for subject in subjects:
         try:
             job = job_from_words(subject, words)
-            wanted.update(name for stage in job.stages for name in job.needed_assets(stage))
+            wanted.update(name for stage in way(job.stages) for name in job.needed_assets(stage))
         except UserError:
             continue  # the subject itself reports it
     for name in sorted(wanted):

@@ -13,6 +13,7 @@ from pipeline.datasets import Dataset, load_dataset, subjects_of
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
 from pipeline.job import job_from_words, shown, workspace_from_words
+from pipeline.stage import usual
 
 MEAN = "mean"
 METRICS = ("psnr", "ssim", "lpips_alex")
@@ -50,7 +51,7 @@ def result_of(subject: str, words: Mapping[str, str]) -> tuple[dict[str, Any] | 
     The result under these words, else the one in use, else None.
     """
     job = job_from_words(subject, words)
-    last = "evaluate" if "evaluate" in job.stages else list(job.stages)[-1]
+    last = "evaluate" if "evaluate" in job.stages else usual(job.stages)[-1]
     try:
         artifact = job.find(last)
     except UserError:  # the footage is not here any more; the result may be

@@ -19,13 +19,14 @@ from pipeline import digest
 from pipeline.artifact import Artifact, Store, clear
 from pipeline.errors import UserError
 from pipeline.settings import Layer, as_dict, command_line_layer, convert, near, read_toml, resolve
-from pipeline.stage import Context, Stage, load_stages
+from pipeline.stage import Context, Loan, Stage, load_stages
 from pipeline.subjects import Subject, load_subject, require_footage
 from pipeline.workspace import Workspace, open_workspace
 
 # Words of the command line that are no stage's settings.
 PLACES = ("data", "artifacts", "assets", "body", "stages")
 WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", "verify", *PLACES)
+OF_ONE_SUBJECT = ("source", "dataset")
 NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
 DEFAULT_PRESET = "quick"
 
@@ -91,6 +92,8 @@ class Job:
             inputs[upstream] = {"files": list(patterns), "sha256": artifact.digest_of(patterns)}
         demands = stage.demands(self.settings[name])
         pins = third_party.load_assets(self.workspace) if demands.assets else {}
+        lent = {loan: self.lent(name, loan).digest_of(loan.files) for loan in demands.loans}
+        loans = {"loans": [{**dataclasses.asdict(loan), "sha256": digest} for loan, digest in lent.items()]}
         return {
             "stage": name,
             "version": stage.version,
@@ -100,7 +103,31 @@ class Job:
             "source": self.source_digest if demands.source else None,
             "body": self.body_digest if demands.body else None,
             "paths": {setting: self.digest_of(path) for setting, path in demands.paths.items()},
+            **(loans if lent else {}),  # no word of it for the others, whose keys stay as they were
         }
+
+    def lent(self, name: str, loan: Loan) -> Artifact:
+        """The result of another subject that a stage reads: the one that these words give, else the latest.
+
+        Raises:
+            UserError: there is none.
+        """
+        own = loan.subject == self.subject.name
+        words = {key: value for key, value in words_to_dict(self.words).items() if key not in OF_ONE_SUBJECT}
+        artifact, reason = None, ""
+        try:
+            artifact = (self if own else job_from_words(loan.subject, words)).find(loan.stage)
+        except (
+            UserError
+        ) as error:  # no such subject, or its footage is not there any more; its results may be
+            reason = f" ({error})"
+        artifact = artifact or self.store.latest(loan.subject, loan.stage)
+        if artifact is None:
+            raise UserError(
+                f"{name} of '{self.subject.name}' needs {loan.stage} of '{loan.subject}': "
+                f"doit run {loan.stage}:{loan.subject}{reason}"
+            )
+        return artifact
 
     def find(self, name: str, found: Found | None = None) -> Artifact | None:
         """The stage's result under the present settings and inputs, if the store holds it.
@@ -109,7 +136,7 @@ class Job:
             found: what this look at the store has found so far, so that each stage is looked at once.
 
         Raises:
-            UserError: the footage is not there.
+            UserError: the footage is not there, or what is read of another subject.
         """
         found = {} if found is None else found
         if name not in found:
@@ -164,6 +191,19 @@ def words_to_dict(words: Iterable[str]) -> dict[str, str]:
     return pairs
 
 
+def spelled_out(words: Mapping[str, str], stages: Mapping[str, Stage]) -> dict[str, str]:
+    """The words with the stage's name before those settings that may stand without it.
+
+    Raises:
+        UserError: a setting is named both ways.
+    """
+    full = {word: f"{name}.{word}" for name, stage in stages.items() for word in stage.words}
+    twice = [word for word in words if full.get(word) in words]
+    if twice:
+        raise UserError(f"the command line: {twice[0]} and {full[twice[0]]} are the same setting")
+    return {full.get(word, word): value for word, value in words.items()}
+
+
 def check_words(words: Mapping[str, str], stages: Mapping[str, Stage]) -> None:
     """Refuses a word that is neither a setting nor one of ``WORDS``, showing the near names."""
     settings = [
@@ -173,7 +213,10 @@ def check_words(words: Mapping[str, str], stages: Mapping[str, Stage]) -> None:
     ]
     for word in words:
         if "." not in word and word not in WORDS:
-            raise UserError(f"the command line: there is no '{word}'{near(word, [*WORDS, *settings])}")
+            short = [word for stage in stages.values() for word in stage.words]
+            raise UserError(
+                f"the command line: there is no '{word}'{near(word, [*WORDS, *short, *settings])}"
+            )
 
 
 def preset_layer(workspace: Workspace, name: str) -> Layer:
@@ -226,6 +269,7 @@ def check_command_line(words: Mapping[str, str]) -> None:
     """
     workspace = workspace_from_words(words)
     stages = load_stages(workspace.stages)
+    words = spelled_out(words, stages)
     check_words(words, stages)
     is_thorough(words)
     resolve({name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, None))
@@ -239,6 +283,7 @@ def job_from_words(subject: str, words: Mapping[str, str]) -> Job:
     """
     workspace = workspace_from_words(words)
     stages = load_stages(workspace.stages)
+    words = spelled_out(words, stages)
     check_words(words, stages)
     who = load_subject(workspace, subject, words.get("source"), words.get("dataset"))
     settings = resolve(
@@ -280,6 +325,7 @@ def run_stage(job: Job, name: str) -> Artifact:
             output=scratch.output,
             work=scratch.work,
             stage=name,
+            loans={loan.stage: job.lent(name, loan).folder for loan in demands.loans},
         )
         start = time.monotonic()
         entry_point(stage)(context)

@@ -25,6 +25,21 @@ from pipeline.settings import near
 
 
 @dataclasses.dataclass(frozen=True)
+class Loan:
+    """Files of another subject that a stage reads.
+
+    Attributes:
+        subject: whose.
+        stage: whose result they are part of.
+        files: patterns of their names; their digests enter the key.
+    """
+
+    subject: str
+    stage: str
+    files: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Demands:
     """What a stage asks for besides its upstream stages, under the settings of one job.
 
@@ -33,12 +48,14 @@ class Demands:
         source: the footage.
         body: the body model and its landmarks.
         paths: the files and folders that settings name, by setting.
+        loans: what is read of other subjects.
     """
 
     assets: tuple[str, ...]
     source: bool
     body: bool
     paths: Mapping[str, Path]
+    loans: tuple[Loan, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +74,12 @@ class Stage:
         reads_body: whether it reads the body model and its landmarks.
         path_settings: the settings that may name a file or a folder, whose content then enters the key.
         path_words: values of theirs that are words, also where a file or folder has that name.
+        on_request: whether it is run only by its name, and is no part of what ``doit run`` does.
+        words: settings that may stand on the command line without the stage's name before them.
+        loans: what it reads of other subjects.
 
-    ``assets``, ``reads_source`` and ``reads_body`` may be functions of the settings object, so that a
-    stage asks only for what these settings call for.
+    ``assets``, ``reads_source``, ``reads_body`` and ``loans`` may be functions of the settings object, so
+    that a stage asks only for what these settings call for.
     """
 
     name: str
@@ -72,6 +92,9 @@ class Stage:
     reads_body: bool | Callable[[Any], bool] = False
     path_settings: tuple[str, ...] = ()
     path_words: tuple[str, ...] = ()
+    on_request: bool = False
+    words: tuple[str, ...] = ()
+    loans: tuple[Loan, ...] | Callable[[Any], tuple[Loan, ...]] = ()
 
     def demands(self, settings: Any) -> Demands:
         """What the stage asks for under these settings."""
@@ -84,6 +107,7 @@ class Stage:
             source=under(self.reads_source),
             body=under(self.reads_body),
             paths=self.named_paths(settings),
+            loans=under(self.loans),
         )
 
     def named_paths(self, settings: Any) -> dict[str, Path]:
@@ -122,6 +146,11 @@ def load_stages(package: str = "stages") -> dict[str, Stage]:
             )
         ordered.update((stage.name, stage) for stage in ready)
     return ordered
+
+
+def usual(stages: Mapping[str, Stage]) -> list[str]:
+    """The stages that are run without being asked for by name, upstream first."""
+    return [name for name, stage in stages.items() if not stage.on_request]
 
 
 class Progress:
@@ -171,6 +200,7 @@ class Context:
         output: what is written here is published.
         work: for checkpoints: it survives a killed run and is never published.
         timings: filled by ``timing``; goes to run.json.
+        loans: stage -> folder of another subject's published files; read only.
     """
 
     subject: str
@@ -184,6 +214,7 @@ class Context:
     work: Path
     stage: str = ""
     timings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    loans: Mapping[str, Path] = dataclasses.field(default_factory=dict)
 
     @contextlib.contextmanager
     def progress(self, total: int, label: str) -> Iterator[Progress]:

@@ -20,7 +20,7 @@ from typing import Any
 from pipeline.artifact import RUN, Artifact
 from pipeline.errors import UserError
 from pipeline.job import Job, job_from_words
-from pipeline.stage import process_environment
+from pipeline.stage import process_environment, usual
 
 SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
 
@@ -90,13 +90,13 @@ def made(job: Job, stages: Iterable[str] | None = None, log: Path | None = None)
 
     Args:
         job: whose, and under which settings.
-        stages: names; all of them if None.
+        stages: names; all that run without being asked for if None.
         log: where the stages' own lines go; this terminal if None.
 
     Raises:
         UserError: a stage stopped.
     """
-    wanted = set(job.stages if stages is None else stages)
+    wanted = set(usual(job.stages) if stages is None else stages)
     for stage in reversed(job.stages):
         wanted |= set(job.stages[stage].needs) if stage in wanted else set()
     found = {}

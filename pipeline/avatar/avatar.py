@@ -249,6 +249,7 @@ class Avatar(nn.Module):
         noise: Tensor | None = None,  # [54 * 6]
         time: float | None = None,
         rows: Tensor | None = None,  # [M]
+        theta: Tensor | None = None,  # [54 * 6]
     ) -> Posed:
         """The Gaussians of one frame.
 
@@ -261,13 +262,14 @@ class Avatar(nn.Module):
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
             rows: [M] int64, each at most once, the Gaussians that pose and residual heads are asked for;
                 all if None.
+            theta: what the heads are told of the pose, see ``pose_features``; that of ``rotation`` if None.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
         blended = blend_transforms(transforms, canonical.skinning_weights)
         shape = decoded.offset + _rest_shape(canonical, rotation, expression)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
-        theta = pose_features(rotation.detach())
+        theta = pose_features(rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
             normals = decoded.surface.rig.normals(transforms, shape)
@@ -314,7 +316,12 @@ class Avatar(nn.Module):
         return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
 
     def gaussians(
-        self, rotation: Tensor, expression: Tensor, transl: Tensor, time: float | None = None
+        self,
+        rotation: Tensor,  # [55, 3]
+        expression: Tensor,  # [E]
+        transl: Tensor,  # [3]
+        time: float | None = None,
+        theta: Tensor | None = None,  # [54 * 6]
     ) -> Gaussians:
         """The finished avatar in a pose, world coordinates.
 
@@ -328,16 +335,16 @@ class Avatar(nn.Module):
             time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
                 the training frames' interval; None, as for a motion that was never filmed, gives what
                 the heads learnt to answer without a clock (see ``residual.py``).
+            theta: what the heads are told of the pose; that of ``rotation`` if None.
         """
         if self._baked is None:
             with torch.no_grad():
                 self._baked = self.decode()
-        seen = self.pose(self._baked, rotation, expression, transl, time=time).gaussians
+        seen = self.pose(self._baked, rotation, expression, transl, time=time, theta=theta).gaussians
         if self.unseen == "nothing" or bool(self.active.all()):
             return seen
-        bare = self.bare(self._unseen_surface(), rotation, expression, transl)
-        fields = [field.name for field in dataclasses.fields(Gaussians)]
-        return Gaussians(**{name: torch.cat([getattr(seen, name), getattr(bare, name)]) for name in fields})
+        bare = self.bare(self.unseen_surface(), rotation, expression, transl)
+        return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
     def bare(self, surface: Surface, rotation: Tensor, expression: Tensor, transl: Tensor) -> Gaussians:
         """The fitted body in its base colours, in a pose: what no network has a say in.
@@ -357,8 +364,8 @@ class Avatar(nn.Module):
             opacities=self._opacities(canonical),
         )
 
-    def _unseen_surface(self) -> Surface:
-        """What the gate took from the finest level."""
+    def unseen_surface(self) -> Surface:
+        """What the gate took from the finest level; only where it took something."""
         known = self._restricted.get(-1)
         if known is None or not torch.equal(known[0], self.active):
             left = self.surface().rows

@@ -127,7 +127,12 @@ class BakedAvatar:
 
     @torch.no_grad()
     def gaussians(
-        self, rotation: Tensor, expression: Tensor, transl: Tensor, time: float | None = None
+        self,
+        rotation: Tensor,  # [55, 3]
+        expression: Tensor,  # [E]
+        transl: Tensor,  # [3]
+        time: float | None = None,
+        theta: Tensor | None = None,  # [54 * 6]
     ) -> Gaussians:
         """The avatar in a pose, world coordinates; as ``Avatar.gaussians``, without gradient.
 
@@ -136,8 +141,9 @@ class BakedAvatar:
             expression: [E].
             transl: [3], metres.
             time: seconds from the clip's start, or None, for the residual colours.
+            theta: what the heads are told of the pose; that of ``rotation`` if None.
         """
-        constants, theta = self.constants, pose_features(rotation)
+        constants, theta = self.constants, pose_features(rotation) if theta is None else theta
         transforms = joint_transforms(rotation[None], constants.joints, self.parents)[0]
         points = self._rest_shape(rotation, expression)
         log_scale, color_logit = constants.log_scale, constants.color_logit

@@ -21,7 +21,7 @@ from pipeline.pose_files import (
     with_flat_hands,
 )
 from pipeline.pose_files.axes import into_world
-from stages.fit.pose_start import is_official_smplx, knows_coefficients
+from pipeline.pose_files.coefficients import is_official_smplx, knows_coefficients
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views
 

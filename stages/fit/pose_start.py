@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel
 from pipeline.pose_files.axes import into_world
+from pipeline.pose_files.coefficients import knows_coefficients
 from pipeline.pose_files.read import InitialPoses
 from stages.fit.facing import pose_facing
 from stages.fit.initialise import weak_perspective
@@ -18,27 +19,7 @@ from stages.fit.observations import Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
 from stages.fit.views import Views
 
-_VERTICES, _TRIANGLES = 10_475, 20_908  # of every release of SMPL-X
 _CHUNK = 256  # frames posed at a time
-
-
-def is_official_smplx(body: BodyModel) -> bool:
-    """Whether coefficients of SMPL-X mean to this body what they mean to SMPL-X.
-
-    Poses carry over between bodies of one skeleton, betas and expressions do not: the open body's are
-    components of its own. The official model is known by its mesh, 10,475 vertices and 20,908 triangles,
-    and by at least ten shape and ten expression directions, which every release has. Gender and release
-    cannot be told, so the coefficients are a start and no more.
-    """
-    counts = body.shape_directions.shape[2], body.expression_directions.shape[2]
-    return len(body.v_template) == _VERTICES and len(body.faces) == _TRIANGLES and min(counts) >= 10
-
-
-def knows_coefficients(start: InitialPoses, body: BodyModel) -> bool:
-    """Whether the shape and the expression that came with poses mean to this body what they meant there."""
-    if start.model == "smplx":
-        return is_official_smplx(body)
-    return start.model == body.digest
 
 
 def initial_facing(start: InitialPoses, body: BodyModel, views: Views) -> np.ndarray:

@@ -9,8 +9,8 @@ import torch
 
 from pipeline.body import joint_index, load_body
 from pipeline.errors import UserError
+from pipeline.motion.bvh import read_bvh
 from stages.ingest.mannequin import MannequinSpec
-from stages.ingest.mannequin.bvh import read_bvh
 from stages.ingest.mannequin.motion import make_motion
 
 BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"

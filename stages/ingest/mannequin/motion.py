@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pipeline.body import JOINT_NAMES, joint_index
-from stages.ingest.mannequin.bvh import read_bvh
-from stages.ingest.mannequin.retarget import retarget
+from pipeline.motion.bvh import read_bvh
+from pipeline.motion.retarget import retarget
 from stages.ingest.mannequin.spec import MannequinSpec
 
 ARMS_DOWN = 1.12

@@ -59,3 +59,14 @@ def paint(context):
                 time.sleep(context.settings.rate)
     context.timing("steps", done)
     (context.output / "painted.txt").write_text((context.inputs["bend"] / "bent.txt").read_text() * done)
+
+
+def sing(context):
+    """Sings what was bent to a tune: a word, a file's text, or what another subject's bend stage made."""
+    note(context)
+    tune = context.settings.tune
+    if context.loans:
+        tune = (context.loans["bend"] / "bent.txt").read_text()
+    elif Path(tune).is_file():
+        tune = Path(tune).read_text()
+    (context.output / "song.txt").write_text((context.inputs["bend"] / "bent.txt").read_text() + tune)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pipeline.body import JOINT_NAMES
 from pipeline.errors import UserError
-from stages.ingest.mannequin.bvh import Bvh, world_motion
+from pipeline.motion.bvh import Bvh, world_motion
 
 _SIDED = {
     "hip": ("upleg", "hip", "thigh"),
@@ -87,28 +87,54 @@ def retarget(
     Raises:
         UserError: the skeleton lacks hips, shoulders, elbows or a neck that we know by name.
     """
+    return retarget_rows(bvh, joints, parents, frame_indices(len(bvh.values), bvh.fps, count, fps))
+
+
+def retarget_rows(
+    bvh: Bvh,
+    joints: Tensor,  # [55, 3]
+    parents: tuple[int, ...],
+    rows: np.ndarray,  # [T]
+    reference: np.ndarray | None = None,  # [R]
+) -> tuple[Tensor, Tensor]:
+    """As ``retarget``, of chosen rows of the capture's table.
+
+    Args:
+        bvh, joints, parents: as for ``retarget``.
+        rows: the frames that are wanted.
+        reference: the frames among which the one with the straightest limbs is sought; ``rows`` if None.
+    """
     columns = match_joints(bvh.names)
-    orientations, positions = world_motion(bvh, frame_indices(len(bvh.values), bvh.fps, count, fps))
+    reference = rows if reference is None else reference
+    orientations, positions = world_motion(bvh, np.concatenate([reference, rows]))
     rest = joints.double()
     places = {name: positions[:, column] for name, column in columns.items()}
-    start = straightest(places)
-    reference = reference_orientations({name: p[start] for name, p in places.items()}, rest, parents)
+    start, wanted = straightest({name: p[: len(reference)] for name, p in places.items()}), len(reference)
+    at_start = reference_orientations({name: p[start] for name, p in places.items()}, rest, parents)
     world: list[Tensor] = []
     for joint, name in enumerate(JOINT_NAMES):
         if name in columns:
             turned = orientations[:, columns[name]]
-            world.append(turned @ turned[start].mT @ reference[joint])
+            world.append(turned[wanted:] @ turned[start].mT @ at_start[joint])
         else:
             world.append(world[parents[joint]])
-    facing = _yaw(world[0][0]).mT
+    facing = yaw(world[0][0]).mT
     local = [facing @ world[0]] + [world[p].mT @ w for p, w in zip(parents[1:], world[1:], strict=True)]
     metres = _leg(rest) / _leg_of(places, start)
-    root = (places["pelvis"] - places["pelvis"][0]) @ facing.mT * metres
+    root = (places["pelvis"][wanted:] - places["pelvis"][wanted]) @ facing.mT * metres
     return roma.rotmat_to_rotvec(torch.stack(local, dim=1)).float(), root.float()
 
 
-def match_joints(names: tuple[str, ...]) -> dict[str, int]:
-    """SMPL-X joint -> place in a capture's list of joints, by the names in common use."""
+def match_joints(names: tuple[str, ...], origin: str = "the BVH skeleton") -> dict[str, int]:
+    """SMPL-X joint -> place in a capture's list of joints, by the names in common use.
+
+    Args:
+        names: the capture's joints.
+        origin: the file, for the message.
+
+    Raises:
+        UserError: hips, shoulders, elbows or neck are not among them.
+    """
     plain = {
         name.rpartition(":")[2].replace("_", "").lower(): place
         for place, name in reversed([*enumerate(names)])
@@ -126,7 +152,8 @@ def match_joints(names: tuple[str, ...]) -> dict[str, int]:
     missing = [joint for joint in _NEEDED if joint not in found]
     if missing:
         raise UserError(
-            f"the BVH skeleton has no joint known as {', '.join(missing)}: name its joints as Mixamo does"
+            f"{origin} has no joint known as {', '.join(missing)} (it has {', '.join(names[:12])}, ...): "
+            "name its joints as Mixamo does"
         )
     return found
 
@@ -206,7 +233,7 @@ def _shortest_turn(here: Tensor, there: Tensor) -> Tensor:
     return roma.rotvec_to_rotmat(axis / axis.norm().clamp_min(1e-12) * angle)
 
 
-def _yaw(orientation: Tensor) -> Tensor:
+def yaw(orientation: Tensor) -> Tensor:
     """The part of an orientation [3, 3] that is a turn about the vertical."""
     forward = orientation[:, 2]
     angle = torch.atan2(forward[0], forward[2])

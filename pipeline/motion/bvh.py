@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
+from pipeline.untrusted import bounded_bytes
 
+_MOST_BYTES = 256 << 20  # an hour of 60 joints at 30 frames a second has some 120 MB
 _POSITIONS = ("Xposition", "Yposition", "Zposition")
 _ROTATIONS = ("Xrotation", "Yrotation", "Zrotation")
 
@@ -42,19 +44,15 @@ def read_bvh(path: Path) -> Bvh:
     """Read a BVH file.
 
     Raises:
-        UserError: the file is missing, is no BVH, or its table does not fit its skeleton.
+        UserError: the file is missing or too large, is no BVH, or its table does not fit its skeleton.
     """
+    content = bounded_bytes(Path(path), _MOST_BYTES, "name another BVH file")
     try:
-        words = Path(path).read_text(encoding="utf-8", errors="replace").split()
-        return _parse(words)
-    except FileNotFoundError:
-        raise UserError(
-            f"{path} is missing: name a BVH file, or leave the mannequin's motion empty"
-        ) from None
-    except (ValueError, StopIteration, OSError) as error:
-        raise UserError(
-            f"{path} cannot be read as BVH ({error or 'it ends early'}): name another file"
-        ) from None
+        return _parse(content.decode("utf-8", errors="replace").split())
+    except (ValueError, StopIteration, IndexError, RuntimeError) as error:
+        # A count that the file does not hold ends a generator early, which Python calls a RuntimeError.
+        reason = "it ends early" if isinstance(error, StopIteration | RuntimeError) else error
+        raise UserError(f"{path} cannot be read as BVH ({reason}): name another file") from None
 
 
 def world_motion(bvh: Bvh, frames: np.ndarray) -> tuple[Tensor, Tensor]:

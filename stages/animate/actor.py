@@ -1,0 +1,107 @@
+"""The avatar as this stage moves it: a pose in, Gaussians out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Avatar, Surface, pose_features
+from pipeline.avatar.bake import BakedAvatar, bake
+from pipeline.body import PARTS, BodyModel, Poses, part_labels
+from pipeline.splat import Gaussians
+
+_LEGS = ("left_leg", "right_leg")
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """How far the training frames turn each joint.
+
+    Attributes:
+        low, high: [324], of ``pose_features``.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    @classmethod
+    def of(cls, poses: Poses, frames: tuple[int, ...]) -> Known:
+        """The range of some frames of a clip."""
+        rows = [row for row, frame in enumerate(poses.frames) if frame in set(frames)]
+        features = torch.stack([pose_features(poses.rotation[row]) for row in rows])
+        return cls(features.amin(0), features.amax(0))
+
+    def nearest(self, rotation: Tensor) -> Tensor:
+        """What the heads are told of a pose [55, 3]: the nearest that lies in the range, [324]."""
+        return pose_features(rotation).clamp(self.low, self.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Actor:
+    """An avatar ready to be moved.
+
+    Attributes:
+        avatar: as it was trained.
+        baked: the same with everything done that does not depend on the pose; None to do without.
+        known: what the heads may be told; None: whatever the pose is.
+        extra: what the clip did not show and is shown all the same, in its base colours; None for nothing.
+        parts: [N] int64, the part of each Gaussian, an index into ``PARTS``.
+    """
+
+    avatar: Avatar
+    baked: BakedAvatar | None
+    known: Known | None
+    extra: Surface | None
+    parts: Tensor
+
+    def __len__(self) -> int:
+        """The number of Gaussians."""
+        return len(self.parts)
+
+    @torch.no_grad()
+    def gaussians(self, rotation: Tensor, expression: Tensor, transl: Tensor) -> Gaussians:
+        """The avatar in a pose, world coordinates.
+
+        There is no clock: the motion was not filmed (see ``pipeline.avatar.residual``).
+
+        Args:
+            rotation: [55, 3] rotation vectors, radians.
+            expression: [E].
+            transl: [3], metres.
+        """
+        theta = self.known.nearest(rotation) if self.known is not None else None
+        source = self.avatar if self.baked is None else self.baked
+        seen = source.gaussians(rotation, expression, transl, time=None, theta=theta)
+        if self.extra is None:
+            return seen
+        bare = self.avatar.bare(self.extra, rotation, expression, transl)
+        return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
+
+
+@torch.no_grad()
+def make_actor(avatar: Avatar, baking: bool, unseen: str, known: Known | None) -> Actor:
+    """An avatar ready to be moved; its ``unseen`` is changed.
+
+    Args:
+        avatar: as it was loaded.
+        baking: whether it is baked.
+        unseen: ``nothing``, ``base``, or ``auto`` for what the avatar itself says.
+        known: see ``Actor``.
+    """
+    shows = avatar.unseen if unseen == "auto" else unseen
+    gated = not bool(avatar.active.all())
+    extra = avatar.unseen_surface() if shows == "base" and gated else None
+    avatar.unseen = "nothing"  # what was gated is added here, to a baked avatar as to one that is not
+    parts = avatar.surface().canonical.parts
+    parts = parts if extra is None else torch.cat([parts, extra.canonical.parts])
+    return Actor(avatar, bake(avatar) if baking else None, known, extra, parts)
+
+
+def legs_share(avatar: Avatar, body: BodyModel) -> float:
+    """The share of the body's legs that the avatar has Gaussians for."""
+    labels = part_labels(body).long()
+    legs = torch.isin(labels, torch.tensor([PARTS.index(name) for name in _LEGS]))
+    kept = avatar.kept[avatar.active.cpu()]
+    return float(legs[kept].sum()) / max(float(legs.sum()), 1.0)

@@ -1,0 +1,226 @@
+"""The animate stage: reads a motion, gives it to the avatar, films it."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipeline.avatar import Avatar, load_avatar
+from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
+from pipeline.camera import Camera
+from pipeline.frames import write_png, write_video
+from pipeline.motion.names import TURNTABLE, motion_name
+from pipeline.motion.place import place
+from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
+from pipeline.motion.record import Span
+from pipeline.pose_files import read_hand_mean
+from pipeline.records import read_cameras, read_split, write_cameras, write_json
+from pipeline.splat import Gaussians, Rendering, render, write_ply
+from pipeline.stage import Context
+from stages.animate.actor import Actor, Known, legs_share, make_actor
+from stages.animate.layers import NAMES, layers_of, write_layers
+from stages.animate.script import Script, cameras_of, origin_of, turntable
+from stages.animate.settings import AnimateSettings
+from stages.animate.sheet import contact_sheet
+
+_HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
+_SHOWN = 12  # joints named in a line
+
+
+def run(context: Context) -> None:
+    """Animates one subject.
+
+    Publishes ``frames.png``, ``cameras.parquet`` and ``animate.json``, and what is asked for of
+    ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and ``ply/<frame>.ply``, frames numbered from 0.
+
+    Raises:
+        UserError: the motion cannot be read, or a file of an upstream stage is missing or damaged.
+    """
+    settings: AnimateSettings = context.settings
+    body = load_body(context.body_file)
+    avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", body)
+    legs = legs_share(avatar, body)
+    script = written(context, avatar, body, legs)
+    start = time.monotonic()
+    actor = actor_of(context, avatar)
+    context.timing("decode_seconds", time.monotonic() - start)
+    cameras = shots(context, script, actor, body)
+    film(context, script, actor, cameras)
+    write_cameras(context.output / "cameras.parquet", dict(enumerate(cameras)))
+    write_json(context.output / "animate.json", summary(settings, script, actor, legs))
+    tell(context, script, len(actor))
+
+
+def written(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> Script:
+    """Reads the motion and gives it to the person."""
+    settings: AnimateSettings = context.settings
+    name, identity = motion_name(settings.motion), avatar.identity
+    if name.kind == TURNTABLE:
+        return turntable(body, identity, settings)
+    span = Span(settings.first_frame, settings.last_frame, settings.fps)
+    wearer = Wearer(body, context.body_file, identity)
+    motion = read_motion(name, wearer, span, settings.up, context.loans)
+    motion = with_relaxed_hands(motion, read_hand_mean(context.body_file))
+    placed = place(motion, body, identity, in_place(settings, legs))
+    return Script(placed, motion.numbers, motion.fps, motion=motion)
+
+
+def in_place(settings: AnimateSettings, legs: float) -> bool:
+    """Whether the pelvis stays where it is."""
+    return settings.way == "still" or (settings.way == "auto" and legs < _HALF_LEGS)
+
+
+def actor_of(context: Context, avatar: Avatar) -> Actor:
+    """The avatar, ready to be moved."""
+    settings: AnimateSettings = context.settings
+    known = None
+    if settings.heads == "known":
+        train = read_split(context.inputs["ingest"] / "split.json").train
+        known = Known.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
+    return make_actor(avatar, settings.bake, settings.unseen, known)
+
+
+def posed(script: Script, actor: Actor, frame: int) -> Gaussians:
+    """The Gaussians of a frame."""
+    placed = script.placed
+    return actor.gaussians(placed.rotation[frame], placed.expression[frame], placed.transl[frame])
+
+
+def shots(context: Context, script: Script, actor: Actor, body: BodyModel) -> list[Camera]:
+    """A camera a frame."""
+    ingest, identity = context.inputs["ingest"], actor.avatar.identity
+    poses = read_poses(context.inputs["fit"] / "poses.parquet")
+    origin = origin_of(poses, read_cameras(ingest / "cameras.parquet"), body, identity)
+    pelvis = rest_joints(body, identity)[0] + script.placed.transl[0]
+    return cameras_of(script, lambda frame: posed(script, actor, frame), context.settings, origin, pelvis)
+
+
+def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) -> None:
+    """Draws every frame once and writes what is asked for."""
+    settings: AnimateSettings = context.settings
+    for kind in ("exr", "ply"):
+        if kind in settings.outputs:
+            (context.output / kind).mkdir()
+    kept: dict[str, np.ndarray] = {}
+    spent: dict[str, list[float]] = defaultdict(list)
+    with context.progress(len(script), "drawing") as progress:
+
+        def pictures() -> Iterator[np.ndarray]:
+            for frame, picture in drawn(context, script, actor, cameras, spent):
+                if frame in sheet_rows(len(script), settings.sheet_frames):
+                    kept[f"{script.numbers[frame]}  {frame / script.fps:.2f} s"] = picture
+                yield picture
+                progress.advance()
+
+        if "video" in settings.outputs:
+            write_video(context.output / "animation.mp4", pictures(), script.fps)
+        else:
+            for _ in pictures():
+                pass
+    write_png(context.output / "frames.png", contact_sheet(kept))
+    each = {name: round(1e3 * statistics.median(times), 3) for name, times in spent.items()}
+    context.timing("milliseconds_a_frame", each)
+
+
+def drawn(
+    context: Context, script: Script, actor: Actor, cameras: list[Camera], spent: dict[str, list[float]]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Every frame with its picture; splats and layers are written on the way, if they are asked for.
+
+    Args:
+        spent: filled with the seconds that each frame took, by what.
+    """
+    settings: AnimateSettings = context.settings
+    gaussians = None
+    for frame, camera in enumerate(cameras):
+        clock = _Clock(spent)
+        fresh = gaussians is None or not script.still
+        gaussians = posed(script, actor, frame) if fresh else gaussians
+        clock.note("pose")
+        with torch.no_grad():
+            rendering = render(gaussians, camera)
+        clock.note("render")
+        if "ply" in settings.outputs and fresh:
+            write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians)
+            clock.note("ply")
+        if "exr" in settings.outputs:
+            layers = layers_of(gaussians, actor.parts, camera, rendering)
+            clock.note("layers")
+            write_layers(context.output / "exr" / f"{frame:06d}.exr", layers)
+            clock.note("exr")
+        yield frame, on_background(rendering, settings.color)
+
+
+def on_background(rendering: Rendering, color: tuple[float, float, float]) -> np.ndarray:
+    """The video's picture, mixed as the clip's colours are encoded: [H, W, 3] uint8 RGB."""
+    image = rendering.color + (1 - rendering.alpha[..., None]) * torch.tensor(color)
+    return (image.clamp(0, 1) * 255).round().byte().numpy()
+
+
+class _Clock:
+    """Seconds since the last look, by what they were spent on."""
+
+    def __init__(self, spent: dict[str, list[float]]) -> None:
+        self.spent, self.last = spent, time.perf_counter()
+
+    def note(self, name: str) -> None:
+        now = time.perf_counter()
+        self.spent[name].append(now - self.last)
+        self.last = now
+
+
+def sheet_rows(count: int, wanted: int) -> set[int]:
+    """The frames on the contact sheet, evenly spaced, first and last included."""
+    return {int(row) for row in np.linspace(0, count - 1, min(count, wanted)).round()}
+
+
+def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float) -> dict[str, Any]:
+    """What ``animate.json`` holds. What differs between equal runs, the times, is in ``run.json``."""
+    motion = script.motion
+    found: dict[str, Any] = {
+        "motion": motion.name if motion else TURNTABLE,
+        "frames": len(script),
+        "fps": script.fps,
+        "source_frames": list(script.numbers),
+        "gaussians": len(actor),
+        "baked": actor.baked is not None,
+        "background": settings.background,
+        "unseen": "base" if actor.extra is not None else "nothing",
+        "heads": settings.heads,
+    }
+    if motion is not None:
+        still = in_place(settings, legs)
+        found |= {
+            "scale": round(script.placed.scale, 6),
+            "way": {"kept": not still, "share_of_legs": round(legs, 4), "threshold": _HALF_LEGS},
+            "joints_not_told": [name for name in JOINT_NAMES if name not in motion.told],
+            "joints_not_used": list(motion.unused),
+            "notes": list(motion.notes),
+        }
+    if "exr" in settings.outputs:
+        found["layers"] = list(NAMES)
+    return found
+
+
+def tell(context: Context, script: Script, gaussians: int) -> None:
+    """Says in a few lines what was made and what a user should know of it."""
+    motion = script.motion
+    for note in motion.notes if motion else ():
+        context.log(note)
+    if motion and motion.unused:
+        more = f" and {len(motion.unused) - _SHOWN} more" if len(motion.unused) > _SHOWN else ""
+        context.log(
+            f"joints of {motion.name} without a counterpart: {', '.join(motion.unused[:_SHOWN])}{more}"
+        )
+    times = ", ".join(
+        f"{name} {value:.1f}" for name, value in context.timings.get("milliseconds_a_frame", {}).items()
+    )
+    context.log(
+        f"{len(script)} frames at {script.fps:.4g} a second, {gaussians} Gaussians; ms a frame: {times}"
+    )

@@ -1,0 +1,116 @@
+"""What is shown, frame by frame: a pose and a camera each."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from pipeline.body import BodyModel, Identity, Poses, rest_joints
+from pipeline.camera import Camera, facing_camera
+from pipeline.motion.place import Placed
+from pipeline.motion.record import Motion
+from pipeline.splat import Gaussians
+from pipeline.turntable import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
+from stages.animate.settings import AnimateSettings
+
+_SAMPLES = 24  # frames that are looked at to place a camera
+
+Pose = Callable[[int], Gaussians]
+"""Frame -> Gaussians in world coordinates."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Script:
+    """What is shown.
+
+    Attributes:
+        placed: a pose a frame.
+        numbers: [T], the frames' numbers in the motion.
+        fps: frames a second.
+        still: whether all poses are the same one.
+        motion: what it was read from; None for a turntable.
+    """
+
+    placed: Placed
+    numbers: tuple[int, ...]
+    fps: float
+    still: bool = False
+    motion: Motion | None = None
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """How the person's own clip began.
+
+    Attributes:
+        camera: of its first frame.
+        pelvis: [3], metres, where the pelvis was, in that camera's axes.
+    """
+
+    camera: Camera
+    pelvis: torch.Tensor
+
+
+def turntable(body: BodyModel, identity: Identity, settings: AnimateSettings) -> Script:
+    """The avatar stands still, in the T pose of the paper's supplement or with its arms lowered."""
+    count = settings.turntable_frames
+    placed = Placed(
+        rotation=relaxed_pose(settings.arm_angle).expand(count, -1, -1),
+        expression=torch.zeros(count, body.expression_directions.shape[2]),
+        transl=-rest_joints(body, identity)[0].expand(count, 3),
+        scale=1.0,
+    )
+    return Script(placed, tuple(range(count)), settings.turntable_fps, still=True)
+
+
+def origin_of(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identity: Identity) -> Origin:
+    """Where the person and the camera were in the clip's first frame."""
+    camera = cameras[poses.frames[0]]
+    pelvis = rest_joints(body, identity)[0] + poses.transl[0]
+    return Origin(camera, camera.rotation @ pelvis + camera.translation)
+
+
+def cameras_of(
+    script: Script, pose: Pose, settings: AnimateSettings, origin: Origin, pelvis: torch.Tensor
+) -> list[Camera]:
+    """A camera a frame.
+
+    Args:
+        script: what is shown.
+        pose: makes Gaussians of its frames.
+        settings: the stage's.
+        origin: of the person's own clip.
+        pelvis: [3], metres, where the pelvis is in the script's first frame.
+    """
+    size, count = (settings.width, settings.height), len(script)
+    if settings.camera == "clip":
+        return [clip_camera(origin, pelvis, *size)] * count
+    if script.still:
+        return orbit(visible_extent(pose(0)), *size, count, settings.turns)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int))
+    boxes = np.stack([visible_box(pose(int(row))) for row in rows])
+    if settings.camera == "orbit":
+        return orbit(extent_of(boxes), *size, count, settings.turns)
+    return [front_camera(boxes, *size)] * count
+
+
+def clip_camera(origin: Origin, pelvis: torch.Tensor, width: int, height: int) -> Camera:
+    """The clip's first camera before the motion, in whose axes it looks level along -Z.
+
+    Args:
+        origin: of the person's own clip.
+        pelvis: [3], where the pelvis begins.
+        width, height: pixels that the picture may have at most; both stay even.
+    """
+    filmed = origin.camera
+    share = min(width / filmed.width, height / filmed.height)
+    size = (max(2, 2 * round(side * share / 2)) for side in (filmed.width, filmed.height))
+    turned = facing_camera(1, 1, 1.0).rotation
+    camera = Camera(filmed.width, filmed.height, filmed.intrinsics, turned, origin.pelvis - turned @ pelvis)
+    return camera.resized(*size)

@@ -1,0 +1,94 @@
+"""A stage that is run only by its name, and what it borrows of another subject."""
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.job import job_from_words, key_of, spelled_out
+from pipeline.settings import as_dict
+from pipeline.stage import load_stages, usual
+
+
+def song(toy, subject):
+    return (toy.store / subject / "sing" / "latest" / "song.txt").read_text()
+
+
+def test_what_is_run_unasked_leaves_it_out(toy):
+    assert list(usual(load_stages("tests.pipeline.toy_stages"))) == ["gather", "bend", "paint"]
+    assert list(usual(load_stages()))[-1] == "evaluate" and "animate" not in usual(load_stages())
+    assert toy.doit("subject=ann").returncode == 0
+    assert toy.ran() == ["gather:ann", "bend:ann", "paint:ann"]
+    listing = toy.doit(command="list", options=("--all",)).stdout
+    assert "sing:ann" in listing and "sing:bob" in listing
+
+
+def test_its_name_alone_means_the_chosen_subjects_and_only_what_it_needs(toy):
+    assert toy.doit("sing", "subject=ann").returncode == 0
+    assert toy.ran() == ["gather:ann", "bend:ann", "sing:ann"] and song(toy, "ann") == "ann 1.0hum"
+    assert toy.doit("sing:bob").returncode == 0
+    assert toy.ran() == ["gather:bob", "bend:bob", "sing:bob"]
+
+
+def test_its_result_is_known_by_the_content_of_the_file_that_drives_it(toy):
+    tune = toy.root / "tune.txt"
+    tune.write_text("la")
+    toy.doit("sing", "subject=ann", f"tune={tune}")
+    toy.ran()
+    toy.doit("sing", "subject=ann", f"tune={tune}")
+    assert toy.ran() == [] and song(toy, "ann") == "ann 1.0la"
+    tune.write_text("lu")
+    toy.doit("sing", "subject=ann", f"tune={tune}")
+    assert toy.ran() == ["sing:ann"] and song(toy, "ann") == "ann 1.0lu"
+    assert toy.doit("subject=ann", f"tune={tune}").returncode == 0
+    assert toy.ran() == ["paint:ann"]
+
+
+def test_what_another_subject_made_is_made_first_and_known_by_its_content(toy):
+    words = ("sing", "subject=ann", "tune=subject:bob")
+    assert toy.doit(*words).returncode == 0
+    assert sorted(toy.ran()) == ["bend:ann", "bend:bob", "gather:ann", "gather:bob", "sing:ann"]
+    assert song(toy, "ann") == "ann 1.0bob 1.0"
+    toy.doit(*words)
+    assert toy.ran() == []
+    (toy.data / "sources" / "bob.txt").write_text("rob ")
+    toy.doit(*words)
+    assert toy.ran() == ["gather:bob", "bend:bob", "sing:ann"] and song(toy, "ann") == "ann 1.0rob 1.0"
+
+
+def test_a_subject_whose_footage_is_gone_lends_what_the_store_has(toy):
+    clip = toy.root / "clip.txt"
+    clip.write_text("me ")
+    toy.doit("bend:me", "subject=me", f"source={clip}")
+    toy.ran()
+    run = toy.doit("sing", "subject=ann", "tune=subject:me")
+    assert run.returncode == 0, run.stderr
+    assert song(toy, "ann") == "ann 1.0me 1.0"
+    run = toy.doit("sing", "subject=ann", "tune=subject:nobody")
+    assert run.returncode != 0 and "nobody" in run.stderr and "Traceback" not in run.stderr
+
+
+def test_clean_takes_its_results_too(toy):
+    toy.doit("sing", "subject=ann")
+    assert toy.doit("subject=ann", command="clean").returncode == 0
+    assert not (toy.store / "ann" / "sing").exists() and not (toy.store / "ann" / "bend").exists()
+
+
+def test_a_short_word_is_its_stages_setting(toy):
+    stages = load_stages("tests.pipeline.toy_stages")
+    assert spelled_out({"tune": "la", "subject": "ann"}, stages) == {"sing.tune": "la", "subject": "ann"}
+    with pytest.raises(UserError, match="tune and sing.tune"):
+        spelled_out({"tune": "la", "sing.tune": "lu"}, stages)
+    run = toy.doit("sing", "subject=ann", "tun=la")
+    assert run.returncode != 0 and "tune" in run.stderr.split("did you mean")[1]
+
+
+def test_keys_of_other_stages_do_not_know_of_loans(toy):
+    words = {"data": str(toy.data), "stages": "tests.pipeline.toy_stages"}
+    job = job_from_words("ann", {**words, "tune": "subject:bob"})
+    description = job.description("gather")
+    assert "loans" not in description and as_dict(job.settings["sing"]) == {"tune": "subject:bob"}
+    assert key_of(description) == key_of(job_from_words("ann", words).description("gather"))
+
+
+def test_a_motion_that_is_not_there_is_refused_before_anything_runs(toy):
+    with pytest.raises(UserError, match=r"motion=nowhere.bvh: there is no such file.*subject:NAME"):
+        job_from_words("smile", {"motion": "nowhere.bvh"})
