@@ -54,6 +54,29 @@ def over(color: Tensor, alpha: Tensor, background: str = BLACK) -> Tensor:
     return color + value * (1 - alpha)[..., None] if value else color
 
 
+def cut_out(image: Tensor, mask: np.ndarray, background: str = BLACK) -> Tensor:
+    """A finished picture under the truth's mask: ``image * alpha + background * (1 - alpha)``.
+
+    What lies outside the mask then counts for nothing, however wrong it is. A picture that was cut out
+    with the same mask before is cut a second time, which darkens or bleaches half-transparent pixels.
+
+    Args:
+        image: [H, W, 3] in [0, 1], on the background.
+        mask: [H, W] uint8, soft alpha.
+        background: one of ``BACKGROUNDS``.
+
+    Returns:
+        [H, W, 3].
+    """
+    alpha = torch.from_numpy(mask).to(image)[..., None] / 255
+    return image * alpha + BACKGROUNDS[background] * (1 - alpha)
+
+
+def person(mask: np.ndarray) -> Tensor:
+    """The person's pixels: alpha above 0.5, [H, W] bool."""
+    return torch.from_numpy(mask > INSIDE * 255)
+
+
 def interior(mask: np.ndarray, erosion: int = EROSION) -> Tensor:
     """The pixels that are the person beyond doubt: alpha above 0.5, eroded by ``erosion`` pixels.
 
