@@ -54,22 +54,25 @@ def over(color: Tensor, alpha: Tensor, background: str = BLACK) -> Tensor:
     return color + value * (1 - alpha)[..., None] if value else color
 
 
-def cut_out(image: Tensor, mask: np.ndarray, background: str = BLACK) -> Tensor:
-    """A finished picture under the truth's mask: ``image * alpha + background * (1 - alpha)``.
+def cut_out(black: Tensor, white: Tensor, mask: np.ndarray, background: str = BLACK) -> Tensor:
+    """A picture of which no more is left than the truth's mask holds.
 
-    What lies outside the mask then counts for nothing, however wrong it is. A picture that was cut out
-    with the same mask before is cut a second time, which darkens or bleaches half-transparent pixels.
+    Its alpha becomes the smaller of its own and the mask's: what lies outside counts for nothing, however
+    wrong it is, and what lies inside stays as it is. Multiplying by the mask, as the authors' release does
+    with renders that have the scene behind them, would cut half-transparent edges out twice here.
 
     Args:
-        image: [H, W, 3] in [0, 1], on the background.
+        black, white: [H, W, 3] in [0, 1], the picture on both backgrounds; they differ where it is clear.
         mask: [H, W] uint8, soft alpha.
         background: one of ``BACKGROUNDS``.
 
     Returns:
         [H, W, 3].
     """
-    alpha = torch.from_numpy(mask).to(image)[..., None] / 255
-    return image * alpha + BACKGROUNDS[background] * (1 - alpha)
+    alpha = 1 - (white - black).mean(-1)
+    kept = torch.minimum(alpha, torch.from_numpy(mask).to(black) / 255)
+    share = kept / alpha.clamp_min(1e-6)
+    return over(black * share[..., None], kept, background)
 
 
 def person(mask: np.ndarray) -> Tensor:

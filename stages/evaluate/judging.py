@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.image import psnr
-from pipeline.metrics.protocol import BACKGROUNDS, cut_out, interior, person
+from pipeline.metrics.protocol import BACKGROUNDS, BLACK, WHITE, cut_out, interior, person
 from pipeline.metrics.regions import Box, region_boxes
 from pipeline.protocols import TRUTH, Protocol
 from pipeline.splat import Rendering
@@ -98,9 +98,8 @@ class Judge:
         """A picture as the protocol cuts it out, made ready."""
         if self._choices.render_mask != TRUTH:
             return self._scorer.composited(on)
-        return self._scorer.composited(
-            lambda background: cut_out(on(background), self.truth.mask, background)
-        )
+        cut = partial(cut_out, on(BLACK), on(WHITE), self.truth.mask)
+        return self._scorer.composited(cut)
 
     @property
     def cuts(self) -> bool:
@@ -128,10 +127,11 @@ class Judge:
     def composites(self, method: str, rendering: Rendering) -> list[Score]:
         """PSNR of a rendering under every composite: either background, its own alpha or the truth's mask."""
         truth, found = self.truth, []
+        both = [scored_picture(rendering, background) for background in (BLACK, WHITE)]
         for background in BACKGROUNDS:
             true = self._evidence.person(truth.frame, background)
             own = scored_picture(rendering, background)
-            masked = cut_out(own, truth.mask, background)
+            masked = cut_out(*both, truth.mask, background)
             for mask, image in (("own", own), ("truth", masked)):
                 found.append(truth.score(method, f"psnr_{background}_{mask}", psnr(image, true)))
         return found

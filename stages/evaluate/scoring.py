@@ -57,7 +57,8 @@ class Score:
         metric: ``psnr``, ``psnr_interior``, ``psnr_person`` (dB), ``ssim``, ``lpips_alex`` or ``lpips_vgg``;
             ``psnr_face``, ``ssim_hands`` and so on of crops; ``psnr_white_truth`` and so on of composites;
             ``flicker`` (levels of 255); ``identity_distance``, ``identity_cosine``, ``identity_found``;
-            ``psnr_seen`` and ``psnr_unseen`` (dB) of surface that training frames show, or do not.
+            ``psnr_seen`` and ``psnr_unseen`` (dB) of surface that training frames show, or do not, and
+            ``unseen_share``, the latter's part of the person.
         value: as the metric is defined, not times 100.
         view: empty for a camera of the training frames; else which other.
     """

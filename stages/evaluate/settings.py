@@ -62,7 +62,7 @@ class EvaluateSettings:
     # How far the arms hang below the T pose in the turn, radians.
     arm_angle: float = 1.0
     # Frames of a motion that was never filmed (arms up, head turned); 0: without it.
-    motion_frames: int = 60
+    motion_frames: int = 48
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done."""

@@ -90,7 +90,8 @@ def _named(name: str, choices: Protocol) -> str:
 
 def _composited(choices: Protocol) -> list[str]:
     cut = (
-        "The truth's mask cuts every picture out, so that what the avatar draws beyond it counts for nothing."
+        "No more is left of any picture than the truth's mask holds: what the avatar draws beyond it counts "
+        "for nothing."
         if choices.render_mask == TRUTH
         else "The truth is cut out by its mask, the avatar by its own alpha."
     )

@@ -98,14 +98,18 @@ def composite_table(summary: Mapping[str, Any]) -> Table:
 
 def camera_table(summary: Mapping[str, Any]) -> Table:
     """The avatar and the textured mesh in cameras that the training frames do not have."""
-    metrics = ("psnr", "psnr_person", "psnr_seen", "psnr_unseen", "ssim")
+    metrics = ("psnr", "psnr_person", "psnr_seen", "psnr_unseen", "unseen_share", "ssim")
     known = [name for name in metrics if any(name in row for row in _camera_rows(summary).values())]
     body = []
     for (view, method), means in _camera_rows(summary).items():
         cells = [Cell(number(name, means[name])) if name in means else Cell("") for name in known]
         body.append(Row(f"{view}: {_METHOD_LABELS[method]}", cells, method == AVATAR))
-    heads = {"psnr_seen": "PSNR seen surface", "psnr_unseen": "PSNR never-seen surface"}
-    return Table([(heads.get(name, label(name)), "↑") for name in known], body)
+    heads = {
+        "psnr_seen": ("PSNR seen surface", "↑"),
+        "psnr_unseen": ("PSNR never-seen surface", "↑"),
+        "unseen_share": ("never seen, share", ""),
+    }
+    return Table([heads.get(name, (label(name), "↑")) for name in known], body)
 
 
 def _camera_rows(summary: Mapping[str, Any]) -> dict[tuple[str, str], Mapping[str, float | None]]:

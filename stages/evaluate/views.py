@@ -9,7 +9,8 @@ show and on the surface that they never show. Which is which is told by the surf
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from stages.evaluate.rendering import Animate, scored_picture
 from stages.evaluate.scoring import AVATAR, MESH, VIEWS, Score
 
 FRAMES = 3  # of each camera
+LEAST = 50  # pixels of seen or never-seen surface, under which a PSNR says nothing
 LOOKED_AT = 24  # training frames that say what was seen
 
 
@@ -127,11 +129,8 @@ def _values(
         "ssim": ssim(image, true, BACKGROUNDS[background]),
     }
     if unseen is not None:
-        values["psnr_unseen"] = psnr(black, true_black, person(mask) & unseen)
-        values["psnr_seen"] = psnr(black, true_black, person(mask) & ~unseen)
+        inside = person(mask)
+        values["unseen_share"] = float((inside & unseen).sum() / inside.sum().clamp_min(1))
+        for name, pixels in (("psnr_unseen", inside & unseen), ("psnr_seen", inside & ~unseen)):
+            values[name] = psnr(black, true_black, pixels) if int(pixels.sum()) >= LEAST else math.nan
     return values
-
-
-def names(folders: Sequence[Path]) -> str:
-    """The cameras' names in a sentence."""
-    return ", ".join(folder.name for folder in folders)
