@@ -64,15 +64,14 @@ def quality(summary: Mapping[str, Any]) -> str:
     score = f"{means[AVATAR]['psnr']:.1f} dB on frames it never saw"
     if rival is None or gain is None:
         return f"{score[0].upper()}{score[1:]}."
+    span = f"{100 * summary['confidence']:.0f}% interval {gain['low']:+.1f} to {gain['high']:+.1f}"
     if gain["low"] > 0:
-        verb = f"Better than {_OVER[rival]} by {gain['mean']:.1f} dB"
+        verb = f"{gain['mean']:.1f} dB better than {_OVER[rival]} ({span})"
     elif gain["high"] < 0:
-        verb = f"Worse than {_OVER[rival]} by {-gain['mean']:.1f} dB"
+        verb = f"{-gain['mean']:.1f} dB worse than {_OVER[rival]} ({span})"
     else:
-        verb = f"No telling it from {_OVER[rival]} ({gain['mean']:+.1f} dB)"
-    percent = f"{100 * summary['confidence']:.0f}%"
-    span = f"({percent} interval {gain['low']:+.1f} to {gain['high']:+.1f})"
-    return f"{verb} {span}: {score}{_sharpness(means, rival)}."
+        verb = f"Level with {_OVER[rival]} ({gain['mean']:+.1f} dB, {span})"
+    return f"{verb}: {score}{_sharpness(means, rival)}."
 
 
 def limits(summary: Mapping[str, Any], sides: Sides) -> str:
