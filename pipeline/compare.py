@@ -13,6 +13,7 @@ from pipeline.datasets import Dataset, load_dataset, subjects_of
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
 from pipeline.job import job_from_words, shown, workspace_from_words
+from pipeline.protocols import ON, OWN, Protocol, chosen
 from pipeline.stage import usual
 
 MEAN = "mean"
@@ -70,6 +71,7 @@ def read_summary(artifact: Artifact) -> dict[str, Any]:
             "means": summary["means"]["test"],
             "protocol": str(summary.get("protocol", "")),
             "background": str(summary.get("background", "black")),
+            "render_mask": str(summary.get("choices", {}).get("render_mask", OWN)),
         }
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
@@ -113,8 +115,12 @@ def table(
 
 def counted(about: Dataset) -> str:
     """Which of our rows was measured as the published ones were: with test poses refined or not."""
-    asked = about.layer.tables.get("evaluate", {}).get("refine_test_poses")
-    return REFINED if asked == "on" else AVATAR
+    return REFINED if wanted(about).refine_test_poses == ON else AVATAR
+
+
+def wanted(about: Dataset) -> Protocol:
+    """What the dataset's own settings make the protocol."""
+    return chosen(about.layer.tables.get("evaluate", {}))
 
 
 def with_mean(values: Mapping[str, Values], subjects: Sequence[str]) -> dict[str, Values]:
@@ -165,10 +171,16 @@ def otherwise(about: Dataset, found: Mapping[str, dict[str, Any]]) -> list[str]:
     unrefined = [subject for subject, one in found.items() if counted(about) not in one["means"]]
     if unrefined:
         remarks.append(f"Not comparable, test poses were not refined: {', '.join(unrefined)}")
-    wanted = about.layer.tables.get("evaluate", {}).get("background")
-    other = [subject for subject, one in found.items() if wanted and one["background"] != wanted]
-    if other:
-        remarks.append(f"Not comparable, the published numbers are on {wanted}: {', '.join(other)}")
+    if {"protocol", "background"} & set(about.layer.tables.get("evaluate", {})):
+        for choice, said in (
+            ("background", "are on {}"),
+            ("render_mask", "have the {}'s mask on both pictures"),
+        ):
+            word = getattr(wanted(about), choice)
+            other = [subject for subject, one in found.items() if one[choice] != word]
+            said = "leave the render its own alpha" if word == OWN else said.format(word)
+            if other:
+                remarks.append(f"Not comparable, the published numbers {said}: {', '.join(other)}")
     return remarks
 
 

@@ -343,16 +343,10 @@ def entry_point(stage: Stage) -> Any:
 
 def run_record(context: Context, seconds: float) -> dict[str, Any]:
     """What differs between two equal runs: time, memory, machine."""
-    try:
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1 if sys.platform != "darwin" else 1024)
-    except ImportError:  # Windows
-        peak = 0
     return {
         "seconds": round(seconds, 3),
         "cpu_seconds": round(time.process_time(), 3),  # of all threads, imports included
-        "peak_memory_mib": round(peak / 1024, 1),
+        "peak_memory_mib": peak_memory(),
         "host": platform.node(),
         "machine": platform.machine(),
         "cores": os.cpu_count(),
@@ -360,6 +354,16 @@ def run_record(context: Context, seconds: float) -> dict[str, Any]:
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "timings": context.timings,
     }
+
+
+def peak_memory() -> float:
+    """The most memory that this process has had at once, MiB; 0 where the platform does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1 if sys.platform != "darwin" else 1024)
+    return round(peak / 1024, 1)
 
 
 def shown(path: Path) -> str:

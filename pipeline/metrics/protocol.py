@@ -54,6 +54,32 @@ def over(color: Tensor, alpha: Tensor, background: str = BLACK) -> Tensor:
     return color + value * (1 - alpha)[..., None] if value else color
 
 
+def cut_out(black: Tensor, white: Tensor, mask: np.ndarray, background: str = BLACK) -> Tensor:
+    """A picture of which no more is left than the truth's mask holds.
+
+    Its alpha becomes the smaller of its own and the mask's: what lies outside counts for nothing, however
+    wrong it is, and what lies inside stays as it is. Multiplying by the mask, as the authors' release does
+    with renders that have the scene behind them, would cut half-transparent edges out twice here.
+
+    Args:
+        black, white: [H, W, 3] in [0, 1], the picture on both backgrounds; they differ where it is clear.
+        mask: [H, W] uint8, soft alpha.
+        background: one of ``BACKGROUNDS``.
+
+    Returns:
+        [H, W, 3].
+    """
+    alpha = 1 - (white - black).mean(-1)
+    kept = torch.minimum(alpha, torch.from_numpy(mask).to(black) / 255)
+    share = kept / alpha.clamp_min(1e-6)
+    return over(black * share[..., None], kept, background)
+
+
+def person(mask: np.ndarray) -> Tensor:
+    """The person's pixels: alpha above 0.5, [H, W] bool."""
+    return torch.from_numpy(mask > INSIDE * 255)
+
+
 def interior(mask: np.ndarray, erosion: int = EROSION) -> Tensor:
     """The pixels that are the person beyond doubt: alpha above 0.5, eroded by ``erosion`` pixels.
 

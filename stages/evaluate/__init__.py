@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=4,
+    version=5,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
@@ -13,10 +13,22 @@ STAGE = Stage(
             "frames/*",
             "masks/*",
             "cameras.parquet",
+            "keypoints.parquet",
             "split.json",
             "footage.json",
+            # Of a mannequin alone: other cameras' pictures, and the surface that was really filmed.
+            "views/*",
+            "truth_poses.parquet",
+            "truth_surface.safetensors",
         ),
-        "fit": ("poses.parquet", "curve.parquet", "overlay.mp4", "overlay.png"),
+        "fit": (
+            "identity.safetensors",
+            "poses.parquet",
+            "curve.parquet",
+            "residuals.parquet",
+            "overlay.mp4",
+            "overlay.png",
+        ),
         "plan": ("plan.json",),
         "train": (
             "avatar.safetensors",
@@ -27,6 +39,8 @@ STAGE = Stage(
             "poses.parquet",
         ),
     },
-    assets=("lpips",),
+    assets=lambda settings: settings.assets,
     reads_body=True,
+    path_settings=("second_mask",),
+    path_words=("off", "edge", "estimator"),
 )

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
+
+from stages.evaluate.evidence import Evidence, evenly
+from stages.evaluate.judging import Judge, On
+from stages.evaluate.mesh import TexturedMesh
+from stages.evaluate.scoring import MEAN, MESH, NEAREST, Picture, Scorer
+from stages.evaluate.settings import EvaluateSettings
 
 Person = Callable[[int], Tensor]
 """Frame number -> the person on the background, [H, W, 3] float in [0, 1]."""
@@ -51,3 +59,57 @@ def nearest_frames(person: Person, training: Sequence[int], held_out: Sequence[i
 
 def _error(image: Tensor, truth: Tensor) -> float:
     return float((image - truth).square().mean(dtype=torch.float64))
+
+
+@dataclasses.dataclass(frozen=True)
+class Baselines:
+    """What stands beside the avatar on a held-out frame.
+
+    Attributes:
+        nearest: held-out frame -> its nearest training frame.
+        mean: the mean frame.
+        copied: training frame -> the person in it.
+        mesh: the textured mesh, where it was asked for.
+        evidence: the clip.
+        ready: a key, what is shown -> the same made ready; remembers the last ones.
+    """
+
+    nearest: Mapping[int, int]
+    mean: On
+    copied: Callable[[int], On]
+    mesh: TexturedMesh | None
+    evidence: Evidence
+    ready: Callable[[tuple[str, int]], Picture]
+
+    def pictures(self, judge: Judge) -> Iterator[tuple[str, Picture]]:
+        """Each baseline's method and picture of the frame that is judged now."""
+        frame = judge.truth.frame
+        for key in ((MEAN, 0), (NEAREST, self.nearest[frame])):
+            shown = self.mean if key[0] == MEAN else self.copied(key[1])
+            yield key[0], judge.make(shown) if judge.cuts else self.ready(key)
+        if self.mesh is not None:
+            yield MESH, judge.make(self.mesh.on(self.evidence.pose(frame), self.evidence.cameras[frame]))
+
+
+def prepare_baselines(
+    evidence: Evidence, scorer: Scorer, settings: EvaluateSettings, mesh: TexturedMesh | None
+) -> Baselines:
+    """Takes the mean of the training frames and finds each held-out frame's nearest."""
+    frames = evidence.split.train
+    training = evenly(frames, settings.baseline_frames or len(frames))
+
+    @lru_cache(maxsize=2)
+    def mean(background: str) -> Tensor:
+        return mean_frame(partial(evidence.person, background=background), training)
+
+    def copied(frame: int) -> On:
+        return partial(evidence.person, frame)
+
+    # Neighbouring held-out frames often share their nearest frame.
+    @lru_cache(maxsize=3)
+    def ready(key: tuple[str, int]) -> Picture:
+        return scorer.composited(mean if key[0] == MEAN else copied(key[1]))
+
+    person = partial(evidence.person, background=scorer.background)
+    nearest = nearest_frames(person, training, evidence.split.test)
+    return Baselines(nearest, mean, copied, mesh, evidence, ready)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from pipeline.body.poses import Poses, read_poses
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
+from pipeline.keypoints import Keypoints, read_keypoints
 from pipeline.metrics.protocol import BLACK, composite
 from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
 
 Item = TypeVar("Item")
+
+OTHER_CAMERA_ANGLE = 5.0
+"""Degrees about the person between a camera and every training camera, from which it is another one."""
 
 Pose = tuple[Tensor, Tensor, Tensor]
 """Rotation [55, 3], expression [E] and transl [3] of a frame."""
@@ -35,6 +41,7 @@ class Evidence:
         cameras: a camera a frame.
         fitted: the fit's poses, of every kept frame.
         refined: the training frames' poses as training left them.
+        keypoints: what was detected in the frames.
     """
 
     folder: Path
@@ -43,6 +50,38 @@ class Evidence:
     cameras: Mapping[int, Camera]
     fitted: Poses
     refined: Poses
+    keypoints: Keypoints
+
+    def points(self, index: int) -> np.ndarray | None:
+        """The frame's 133 whole-body points with scores, [133, 3]; None where nobody looked at it."""
+        try:
+            return self.keypoints.whole_body[self.keypoints.index(index)]
+        except KeyError:
+            return None
+
+    def follow(self, first: int, second: int) -> bool:
+        """Whether the second frame is the next that was kept after the first."""
+        rows = _rows(tuple(sorted(self.cameras)))
+        return first in rows and rows.get(second) == rows[first] + 1
+
+    @cached_property
+    def other_cameras(self) -> frozenset[int]:
+        """The held-out frames whose camera stands elsewhere than every training frame's does.
+
+        A camera that walks around passes between the places that it was seen from; only a view that is
+        ``OTHER_CAMERA_ANGLE`` or more off, as seen from the person, is another one.
+        """
+        person = self.fitted.transl.mean(0)
+
+        def directions(frames: Sequence[int]) -> Tensor:
+            centres = torch.stack([self.cameras[frame].centre for frame in frames]) - person
+            return torch.nn.functional.normalize(centres, dim=1)
+
+        if not self.split.test:
+            return frozenset()
+        cosines = (directions(self.split.test) @ directions(self.split.train).mT).amax(1)
+        far = cosines < math.cos(math.radians(OTHER_CAMERA_ANGLE))
+        return frozenset(frame for frame, other in zip(self.split.test, far.tolist(), strict=True) if other)
 
     def frame(self, index: int) -> np.ndarray:
         """The frame as filmed, [H, W, 3] uint8 RGB."""
@@ -97,6 +136,7 @@ def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
         cameras=read_cameras(ingest / "cameras.parquet"),
         fitted=read_poses(inputs["fit"] / "poses.parquet"),
         refined=read_poses(inputs["train"] / "poses.parquet"),
+        keypoints=read_keypoints(ingest / "keypoints.parquet"),
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from pipeline.metrics.lpips import NETWORKS
 from pipeline.plan import Plan
+from pipeline.protocols import PLAN
 from stages.evaluate.evidence import Evidence
 from stages.evaluate.records import Gate
 from stages.evaluate.refinement import EFFECT, Refinement
@@ -89,10 +90,24 @@ def _of_the_numbers(
     for network in sorted(set(NETWORKS) - set(settings.lpips_networks)):
         why = f"not asked for (evaluate.lpips_networks){_LPIPS_COST.get(network, '')}"
         found.append(Omission(f"LPIPS with {network}", why))
-    bare = len({one.frame for one in scores if one.split == HELD_OUT and math.isnan(one.value)})
+    if evidence.split.test:
+        found += _of_the_extras(settings)
+    inside = [one for one in scores if (one.split, one.metric) == (HELD_OUT, "psnr_interior")]
+    bare = len({one.frame for one in inside if math.isnan(one.value)})
     if bare:
         found.append(Omission("Interior of " + _count(bare, "frame"), "the eroded mask is empty there"))
     return found
+
+
+def _of_the_extras(settings: EvaluateSettings) -> list[Omission]:
+    missing = {
+        "The ceiling by masks": settings.second_mask == "off" and "evaluate.second_mask=off",
+        "The textured mesh": settings.mesh_frames == 0 and "evaluate.mesh_frames=0",
+        "Whose face it is": not settings.identity
+        and "evaluate.identity=true asks for it; it fetches dlib and its weights (100 MB)",
+        "A motion never filmed": settings.motion_frames == 0 and "evaluate.motion_frames=0",
+    }
+    return [Omission(what, why) for what, why in missing.items() if why]
 
 
 def _of_the_poses(
@@ -104,8 +119,11 @@ def _of_the_poses(
         return [Omission("Refinement of " + _count(len(refinement.stopped), "test pose"), why)]
     if refinement.poses or not evidence.split.test:
         return []
-    asked = settings.refine_test_poses
-    reason = plan[EFFECT].why if asked == "auto" else f"evaluate.refine_test_poses={asked}"
+    asked = settings.choices.refine_test_poses
+    named = (
+        "refine_test_poses=off" if settings.refine_test_poses == asked else f"protocol={settings.protocol}"
+    )
+    reason = plan[EFFECT].why if asked == PLAN else f"evaluate.{named}"
     why = (
         "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels: "
         + reason

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
 from torch import Tensor
 
+from pipeline.metrics.regions import Box
 from stages.evaluate.rendering import to_bytes
 
+CLOSEUP = 160  # pixels
 _GAP = 6  # pixels between pictures
 _BAND = 26  # pixels of the caption above a column
 _PAPER = 255
@@ -46,6 +48,36 @@ class Comparison:
         cut = (slice(top, bottom), slice(left, right))
         truth, render, error = (picture[cut] for picture in self.pictures)
         return dataclasses.replace(self, truth=truth, render=render, error=error)
+
+
+@dataclasses.dataclass(frozen=True)
+class Closeup:
+    """A face or a hand of one frame, enlarged.
+
+    Attributes:
+        region: ``face`` or ``hands``.
+        comparison: truth, render and error of it.
+    """
+
+    region: str
+    comparison: Comparison
+
+
+def closeups(whole: Comparison, boxes: Mapping[str, Sequence[Box]]) -> list[Closeup]:
+    """The crops of a comparison of whole pictures, each ``CLOSEUP`` pixels high or more.
+
+    Enlarged so that each pixel stays a square: what is blurred is the render, not the page.
+    """
+    found = []
+    for region, each in boxes.items():
+        for box in each:
+            part = whole.cropped(box)
+            factor = max(1, -(-CLOSEUP // part.truth.shape[0]))
+            truth, render, error = (
+                np.kron(one, np.ones((factor, factor, 1), np.uint8)) for one in part.pictures
+            )
+            found.append(Closeup(region, dataclasses.replace(part, truth=truth, render=render, error=error)))
+    return found
 
 
 def compare(frame: int, truth: Tensor, render: Tensor, gain: float, psnr: float) -> Comparison:

@@ -20,6 +20,10 @@ VISIBILITY = pa.schema([("captured", pa.float32()), ("kept", pa.bool_())])
 a Gaussian."""
 
 
+RESIDUALS = pa.schema([("pixels", pa.float32())])
+"""The column of fit's residuals.parquet that is read."""
+
+
 @dataclasses.dataclass(frozen=True)
 class StageRecord:
     """What a stage says of the run that made its result.
@@ -28,11 +32,17 @@ class StageRecord:
         name: the stage's.
         settings: as it ran.
         seconds: wall clock; None where the run was not recorded.
+        memory: peak of the process, MiB; None likewise.
+        version: of the stage; None where its manifest does not say.
+        made: when, and with what: host and Python; empty where not recorded.
     """
 
     name: str
     settings: Mapping[str, Any]
     seconds: float | None
+    memory: float | None = None
+    version: int | None = None
+    made: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,12 +73,15 @@ def stage_records(inputs: Mapping[str, Path]) -> list[StageRecord]:
     """
     records = []
     for name, folder in inputs.items():
-        settings = _read(folder / MANIFEST).get("settings")
-        seconds = _read(folder / RUN).get("seconds")
+        manifest, run = _read(folder / MANIFEST), _read(folder / RUN)
+        settings, version = manifest.get("settings"), manifest.get("version")
         record = StageRecord(
             name=name,
             settings=settings if isinstance(settings, dict) else {},
-            seconds=float(seconds) if isinstance(seconds, int | float) else None,
+            seconds=_number(run.get("seconds")),
+            memory=_number(run.get("peak_memory_mib")),
+            version=version if isinstance(version, int) else None,
+            made=", ".join(str(run[key]) for key in ("finished", "host") if isinstance(run.get(key), str)),
         )
         records.append(record)
     return records
@@ -105,6 +118,20 @@ def plan_savings(train: Path) -> dict[str, dict[str, float]]:
     timings = _read(train / RUN).get("timings")
     found = timings.get("saved") if isinstance(timings, dict) else None
     return {name: each for name, each in (found or {}).items() if isinstance(each, dict)}
+
+
+def fit_error(fit: Path) -> float | None:
+    """The mean reprojection error of the fit on trusted keypoints, pixels; None where there is none.
+
+    Raises:
+        UserError: the table is missing or damaged.
+    """
+    pixels = read_table(fit / "residuals.parquet", RESIDUALS, "run the fit stage again")["pixels"]
+    return float(pixels.mean()) if len(pixels) else None
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _read(path: Path) -> dict[str, Any]:

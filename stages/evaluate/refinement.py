@@ -19,6 +19,7 @@ from pipeline.body import Poses, write_poses
 from pipeline.metrics.image import dissimilarity
 from pipeline.metrics.protocol import BACKGROUNDS, over
 from pipeline.plan import Plan
+from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
 from stages.evaluate.evidence import Evidence, Pose
 from stages.evaluate.rendering import Animate
@@ -50,10 +51,9 @@ NONE = Refinement({}, (), 0)
 
 
 def called_for(settings: EvaluateSettings, plan: Plan) -> bool:
-    """Whether test poses are refined: as the setting says, else as the plan does."""
-    if settings.refine_test_poses == "auto":
-        return plan.on(EFFECT)
-    return settings.refine_test_poses == "on"
+    """Whether test poses are refined: as the protocol or a setting says, or the plan where they leave it."""
+    asked = settings.choices.refine_test_poses
+    return plan.on(EFFECT) if asked == PLAN else asked == ON
 
 
 def refine(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,17 +14,18 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from stages.evaluate import tables
 from stages.evaluate.omissions import Omission
-from stages.evaluate.pictures import Comparison
+from stages.evaluate.pictures import Closeup, Comparison
 from stages.evaluate.plan_table import PlanRow
 from stages.evaluate.records import StageRecord
-from stages.evaluate.scoring import AVATAR, HELD_OUT
-from stages.evaluate.summary import LABELS, METRIC_LABELS, best, lower_is_better, number, rows
+from stages.evaluate.scoring import HELD_OUT
 
 LARGEST_VIDEO = 24 * 2**20
 """Bytes of a video that is still embedded; browsers choke on much longer data URIs."""
 
-_JPEG_QUALITY = 92
+_JPEG_QUALITY, _SLIDER_QUALITY = 92, 85
+_SCRIPT = "slider.js"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +36,11 @@ class Material:
         summary: what ``summary.json`` holds.
         clip: one sentence on the footage.
         cover: pictures of the person, [H, W, 3] uint8 RGB, in two pairs of one size each.
-        comparisons: truth, render and error of a few frames.
+        comparisons: truth, render and error of some frames, for the slider.
+        closeups: faces and hands.
         error_gain: what the error was multiplied by.
         turntable: the turn, MP4.
+        motion: a motion that was never filmed, MP4; where it exists.
         overlay: the fit drawn over the clip, MP4, and the same as one picture; whichever exists.
         curve: drawings of the training curve, SVG.
         fit_curve: drawings of what accuracy cost the registration, SVG.
@@ -47,14 +51,17 @@ class Material:
         score_picture: the body coloured by score, where it exists.
         omissions: what was left out.
         stages: upstream first.
+        versions: what made the result, name -> version.
     """
 
     summary: Mapping[str, Any]
     clip: str
     cover: Sequence[np.ndarray]
     comparisons: Sequence[Comparison]
+    closeups: Sequence[Closeup]
     error_gain: float
     turntable: Path
+    motion: Path
     overlay: Sequence[Path]
     curve: Sequence[str]
     fit_curve: Sequence[str]
@@ -65,6 +72,7 @@ class Material:
     score_picture: Path
     omissions: Sequence[Omission]
     stages: Sequence[StageRecord]
+    versions: Mapping[str, str]
 
 
 def write_report(path: Path, material: Material) -> None:
@@ -79,17 +87,24 @@ def write_report(path: Path, material: Material) -> None:
 
 def _contents(material: Material) -> dict[str, Any]:
     summary = material.summary
+    script = (Path(__file__).parent / _SCRIPT).read_text(encoding="utf-8")
     return {
         "subject": summary["subject"],
         "summary": summary,
         "clip": material.clip,
         "cover": [picture_uri(picture) for picture in material.cover],
         "cover_columns": " ".join(f"{one.shape[1] / one.shape[0]:.4f}fr" for one in material.cover),
-        "table": _table(summary["means"], summary["metrics"]),
-        "comparisons": [_comparison(one) for one in material.comparisons],
+        "table": tables.main_table(summary),
+        "composites": tables.composite_table(summary),
+        "regions": tables.region_tables(summary),
+        "likeness": tables.likeness_table(summary),
+        "cameras": tables.camera_table(summary),
+        "closeups": [_closeup(one) for one in material.closeups],
+        "comparisons": [_comparison(one, _SLIDER_QUALITY) for one in material.comparisons],
         "held_out": HELD_OUT in summary["means"],
         "error_gain": f"{material.error_gain:g}",
         "turntable": video_uri(material.turntable),
+        "motion": _overlay([material.motion]),
         "overlay": _overlay(material.overlay),
         "curve": [Markup(drawing) for drawing in material.curve],
         "fit_curve": [Markup(drawing) for drawing in material.fit_curve],
@@ -101,24 +116,26 @@ def _contents(material: Material) -> dict[str, Any]:
         "omissions": material.omissions,
         "stages": material.stages,
         "total": _total(material.stages),
+        "peak": max((stage.memory for stage in material.stages if stage.memory), default=None),
+        "versions": material.versions,
+        "script": Markup(script),
+        "script_hash": script_hash(script),
     }
 
 
-def _table(means: Mapping[str, Any], metrics: Sequence[str]) -> dict[str, Any]:
-    winners = {metric: best(means, metric) for metric in metrics}
-    body = []
-    for split, method, row in rows(means):
-        wins = [split == HELD_OUT and winners[name] == method for name in metrics]
-        cells = [(number(name, row[name]), win) for name, win in zip(metrics, wins, strict=True)]
-        main = (split, method) == (HELD_OUT, AVATAR)
-        body.append({"label": LABELS[split, method], "cells": cells, "main": main})
-    head = [(METRIC_LABELS[name], "↓" if lower_is_better(name) else "↑") for name in metrics]
-    return {"head": head, "rows": body}
+def script_hash(script: str) -> str:
+    """What the page's policy admits: this script and no other."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
 
 
-def _comparison(one: Comparison) -> dict[str, Any]:
-    truth, render, error = (picture_uri(picture) for picture in one.pictures)
+def _comparison(one: Comparison, quality: int = _JPEG_QUALITY) -> dict[str, Any]:
+    truth, render, error = (picture_uri(picture, quality) for picture in one.pictures)
     return {"frame": one.frame, "psnr": f"{one.psnr:.2f}", "truth": truth, "render": render, "error": error}
+
+
+def _closeup(one: Closeup) -> dict[str, Any]:
+    name = "Face" if one.region == "face" else "Hand"
+    return {"name": name, **_comparison(one.comparison, _SLIDER_QUALITY)}
 
 
 def _overlay(candidates: Sequence[Path]) -> dict[str, str] | None:
@@ -136,10 +153,10 @@ def _total(stages: Sequence[StageRecord]) -> float | None:
     return sum(seconds) if seconds else None
 
 
-def picture_uri(image: np.ndarray) -> str:
+def picture_uri(image: np.ndarray, quality: int = _JPEG_QUALITY) -> str:
     """[H, W, 3] uint8 RGB as a data URI."""
     stored = np.ascontiguousarray(image[..., ::-1])
-    encoded = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+    encoded = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return _uri("image/jpeg", encoded.tobytes())
 
 

@@ -12,30 +12,46 @@ import torch
 
 from pipeline import artifact
 from pipeline.avatar import load_avatar
-from pipeline.body import load_body
+from pipeline.body import BodyModel, load_body, read_identity
 from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
-from pipeline.job import shown
+from pipeline.job import peak_memory, shown
 from pipeline.metrics import Lpips
+from pipeline.metrics.identity import FaceReader
 from pipeline.plan import Plan, read_plan
 from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context
-from stages.evaluate.assessment import Assessment, assess, scored_frames
+from pipeline.versions import versions
+from stages.evaluate.assessment import Assessment, Extras, assess, scored_frames
 from stages.evaluate.curve import draw_curve, draw_fit, draw_scores
-from stages.evaluate.evidence import Evidence, read_evidence
+from stages.evaluate.evidence import Evidence, evenly, read_evidence
+from stages.evaluate.mesh import TexturedMesh, textured_mesh
+from stages.evaluate.motion import motion_pictures
 from stages.evaluate.omissions import omissions
 from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
 from stages.evaluate.plan_table import plan_rows
-from stages.evaluate.records import StageRecord, fit_seconds, plan_savings, read_gate, stage_records
+from stages.evaluate.records import (
+    Gate,
+    StageRecord,
+    fit_error,
+    fit_seconds,
+    plan_savings,
+    read_gate,
+    stage_records,
+)
 from stages.evaluate.refinement import NONE, Refinement, called_for, refine, write_refined
 from stages.evaluate.rendering import Animate, animator, follower, on_grey, render_frame
 from stages.evaluate.report import Material, write_report
-from stages.evaluate.scoring import Scorer, table, write_scores
+from stages.evaluate.scoring import Score, Scorer, write_scores
+from stages.evaluate.second_mask import second_masks
 from stages.evaluate.settings import EvaluateSettings
-from stages.evaluate.summary import protocol, show_summary
+from stages.evaluate.summarise import summarise
+from stages.evaluate.summary import show_summary
 from stages.evaluate.turntable import orbit, relaxed_pose, turn_pictures, visible_extent
+from stages.evaluate.verdict import Sides, verdict
+from stages.evaluate.views import read_filmed, score_views, view_folders
 
 _COVER_HEIGHT = 400  # pixels
 
@@ -44,18 +60,64 @@ def run(context: Context) -> None:
     """Evaluates the trained avatar of one subject.
 
     Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
-    ``turntable.mp4`` and ``avatar.ply``, and ``test_poses.parquet`` where the test poses were refined.
+    ``turntable.mp4``, ``motion.mp4`` and ``avatar.ply``, and ``test_poses.parquet`` where the test poses were
+    refined.
 
     Raises:
         UserError: a file of an upstream stage or an asset is missing or damaged.
     """
-    avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", load_body(context.body_file))
-    networks = {name: Lpips(context.assets["lpips"], name) for name in context.settings.lpips_networks}
-    scorer = Scorer(networks, context.settings.background)
-    evaluate(context, read_evidence(context.inputs), animator(avatar), follower(avatar), scorer)
+    settings: EvaluateSettings = context.settings
+    body = load_body(context.body_file)
+    avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", body)
+    networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
+    evidence, animate = read_evidence(context.inputs), animator(avatar)
+    mesh = make_mesh(context, evidence, body)
+    extras = Extras(
+        mesh=mesh,
+        second=second_masks(context, evidence),
+        reader=FaceReader(context.assets["dlib"], context.assets["identity"]) if settings.identity else None,
+    )
+    scorer = Scorer(networks, settings.choices.background)
+    views = score_other_cameras(context, evidence, animate, body, mesh)
+    evaluate(context, evidence, animate, follower(avatar), scorer, extras, views)
 
 
-def evaluate(context: Context, evidence: Evidence, animate: Animate, follow: Animate, scorer: Scorer) -> None:
+def make_mesh(context: Context, evidence: Evidence, body: BodyModel) -> TexturedMesh | None:
+    """The textured mesh, where it was asked for and any frame is held out to compare it in."""
+    settings: EvaluateSettings = context.settings
+    if not settings.mesh_frames:
+        return None
+    start = time.monotonic()
+    identity = read_identity(context.inputs["fit"] / "identity.safetensors", body)
+    frames = evenly(evidence.split.train, settings.mesh_frames)
+    with context.progress(len(frames), "textured mesh") as progress:
+        mesh = textured_mesh(evidence, body, identity, frames, progress.advance)
+    context.timing("mesh_seconds", time.monotonic() - start)
+    return mesh
+
+
+def score_other_cameras(
+    context: Context, evidence: Evidence, animate: Animate, body: BodyModel, mesh: TexturedMesh | None
+) -> list[Score]:
+    """What a mannequin's other cameras say; nothing for any other subject."""
+    if not view_folders(evidence):
+        return []
+    start = time.monotonic()
+    filmed = read_filmed(evidence, body)
+    scores = score_views(evidence, animate, mesh, filmed, context.settings.choices.background)
+    context.timing("views_seconds", time.monotonic() - start)
+    return scores
+
+
+def evaluate(
+    context: Context,
+    evidence: Evidence,
+    animate: Animate,
+    follow: Animate,
+    scorer: Scorer,
+    extras: Extras | None = None,
+    views: list[Score] | None = None,
+) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
 
     Args:
@@ -64,29 +126,44 @@ def evaluate(context: Context, evidence: Evidence, animate: Animate, follow: Ani
         animate: a pose -> Gaussians.
         follow: the same with gradients that reach the pose; asked only where test poses are refined.
         scorer: the metrics.
+        extras: what else is judged, or judges.
+        views: scores in cameras that are not the clip's.
     """
     settings: EvaluateSettings = context.settings
+    extras = extras or Extras()
     start = time.monotonic()
-    plan = read_plan(context.inputs["plan"] / "plan.json")
+    plan, gate = read_plan(context.inputs["plan"] / "plan.json"), read_gate(context.inputs["train"])
     refinement = refine_test_poses(context, evidence, plan, follow, scorer.background)
     scoring = time.monotonic()
     with context.progress(len(scored_frames(evidence, settings)), "scoring") as progress:
-        assessment = assess(evidence, animate, scorer, settings, refinement.poses, progress.advance)
+        assessment = assess(
+            evidence, animate, scorer, settings, refinement.poses, progress.advance, extras
+        ).with_views(views or [])
     context.timing("scoring_seconds", time.monotonic() - scoring)
     write_scores(context.output / "metrics.parquet", assessment.scores)
     relaxed = relaxed_gaussians(evidence, animate, settings)
     write_ply(context.output / "avatar.ply", relaxed)
     write_turntable(context, relaxed)
+    write_motion(context, evidence, animate)
     cover = cover_pictures(evidence, animate, assessment, relaxed)
     write_png(context.output / "cover.png", beside(cover))
     sheet = comparison_sheet(assessment.comparisons, settings.error_gain)
     write_png(context.output / "comparison.png", sheet)
-    summary = summarise(context, evidence, assessment, scorer, refinement, len(relaxed))
+    summary = summarise(context, evidence, assessment, scorer, refinement, gate, extras)
+    summary["gaussians"] = len(relaxed)
+    summary["verdict"] = verdict(summary, sides(context, plan, gate))
     write_json(context.output / "summary.json", summary)
-    own = StageRecord("evaluate", as_dict(settings), time.monotonic() - start)
-    material = gather(context, evidence, assessment, (plan, refinement), summary, cover, own)
+    own = StageRecord("evaluate", as_dict(settings), time.monotonic() - start, peak_memory(), made="this run")
+    material = gather(context, evidence, assessment, (plan, refinement, gate), summary, cover, own)
     write_report(context.output / "report.html", material)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def sides(context: Context, plan: Plan, gate: Gate) -> Sides:
+    """What the clip shows of the person."""
+    return Sides(
+        1 - gate.kept / gate.vertices, plan["auxiliary_views"].values, fit_error(context.inputs["fit"])
+    )
 
 
 def refine_test_poses(
@@ -121,22 +198,23 @@ def gather(
     context: Context,
     evidence: Evidence,
     assessment: Assessment,
-    decided: tuple[Plan, Refinement],
+    decided: tuple[Plan, Refinement, Gate],
     summary: dict[str, Any],
     cover: list[np.ndarray],
     own: StageRecord,
 ) -> Material:
     """What the report shows, from this stage and from the upstream stages' folders."""
     fit, train, settings = context.inputs["fit"], context.inputs["train"], context.settings
-    gate = read_gate(train)
-    plan, refinement = decided
+    plan, refinement, gate = decided
     return Material(
         summary=summary,
         clip=describe_clip(evidence),
         cover=cover,
-        comparisons=assessment.comparisons,
+        comparisons=assessment.slider,
+        closeups=assessment.closeups,
         error_gain=settings.error_gain,
         turntable=context.output / "turntable.mp4",
+        motion=context.output / "motion.mp4",
         overlay=(fit / "overlay.mp4", fit / "overlay.png"),
         curve=draw_curve(read_curve(train / "curve.parquet", "run the train stage again")),
         fit_curve=draw_fit(read_curve(fit / "curve.parquet", "run the fit stage again"), fit_seconds(fit)),
@@ -147,6 +225,7 @@ def gather(
         score_picture=train / "visibility.png",
         omissions=omissions(evidence, settings, assessment.scores, gate, plan, refinement),
         stages=[*stage_records(context.inputs), own],
+        versions=versions(),
     )
 
 
@@ -174,6 +253,18 @@ def write_turntable(context: Context, gaussians: Gaussians) -> None:
     context.timing("turntable_seconds", time.monotonic() - start)
 
 
+def write_motion(context: Context, evidence: Evidence, animate: Animate) -> None:
+    """Writes ``motion.mp4``, a motion that was never filmed, where it was asked for."""
+    settings: EvaluateSettings = context.settings
+    if not settings.motion_frames:
+        return
+    size = (settings.turntable_width, settings.turntable_height)
+    expressions, start = evidence.fitted.expression.shape[1], time.monotonic()
+    pictures = motion_pictures(animate, expressions, settings.motion_frames, settings.arm_angle, size)
+    write_video(context.output / "motion.mp4", pictures, settings.turntable_fps)
+    context.timing("motion_seconds", time.monotonic() - start)
+
+
 def cover_pictures(
     evidence: Evidence, animate: Animate, assessment: Assessment, relaxed: Gaussians
 ) -> list[np.ndarray]:
@@ -198,32 +289,6 @@ def both_sides(gaussians: Gaussians) -> list[np.ndarray]:
     masks = [(rendering.alpha.clamp(0, 1) * 255).byte().numpy() for rendering in renderings]
     left, top, right, bottom = person_box(masks)
     return [on_grey(rendering)[top:bottom, left:right] for rendering in renderings]
-
-
-def summarise(
-    context: Context,
-    evidence: Evidence,
-    assessment: Assessment,
-    scorer: Scorer,
-    refinement: Refinement,
-    gaussians: int,
-) -> dict[str, Any]:
-    """What ``summary.json`` holds."""
-    return {
-        "subject": context.subject,
-        "frames": {"train": len(evidence.split.train), "test": len(evidence.split.test)},
-        "gaussians": gaussians,
-        "metrics": list(scorer.metrics),
-        "means": table(assessment.scores, scorer.metrics),
-        "nearest": {str(frame): nearest for frame, nearest in sorted(assessment.nearest.items())},
-        "background": scorer.background,
-        "refined": {
-            "frames": len(refinement.poses),
-            "stopped": list(refinement.stopped),
-            "steps": refinement.steps,
-        },
-        "protocol": protocol(scorer.background, refinement),
-    }
 
 
 def describe_clip(evidence: Evidence) -> str:

@@ -13,9 +13,12 @@ import torch
 from torch import Tensor
 
 from pipeline.metrics.image import psnr, ssim
+from pipeline.metrics.intervals import Interval, interval
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.protocol import BACKGROUNDS, BLACK
+from pipeline.metrics.regions import Box
 from pipeline.tables import write_table
+from stages.evaluate.settings import EvaluateSettings
 
 SCHEMA = pa.schema(
     [
@@ -24,14 +27,23 @@ SCHEMA = pa.schema(
         ("method", pa.string()),
         ("metric", pa.string()),
         ("value", pa.float64()),
+        ("view", pa.string()),
     ]
 )
 
-AVATAR, REFINED, MEAN, NEAREST = METHODS = ("avatar", "avatar_refined", "mean_frame", "nearest_frame")
-"""What is scored: the avatar, the avatar with test poses refined, and the two baselines."""
+AVATAR, REFINED, MEAN, NEAREST, MESH, CEILING = METHODS = (
+    "avatar", "avatar_refined", "mean_frame", "nearest_frame", "textured_mesh", "second_mask",
+)  # fmt: skip
+"""What is scored: the avatar, the avatar with test poses refined, the three baselines, and the true frame
+itself under a second mask."""
 
-HELD_OUT, TRAINING = "test", "train"
-"""The splits, by their names in split.json."""
+BASELINES = (MEAN, NEAREST, MESH)
+
+HELD_OUT, TRAINING, VIEWS = SPLITS = ("test", "train", "views")
+"""The splits, by their names in split.json, and a mannequin's unseen cameras."""
+
+OTHER_CAMERA = "other camera"
+"""The view of a held-out frame that no training camera filmed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,10 +52,15 @@ class Score:
 
     Attributes:
         frame: number in the source clip.
-        split: ``test`` or ``train``.
+        split: one of ``SPLITS``.
         method: one of ``METHODS``.
-        metric: ``psnr`` (dB), ``psnr_interior`` (dB), ``ssim``, ``lpips_alex`` or ``lpips_vgg``.
+        metric: ``psnr``, ``psnr_interior``, ``psnr_person`` (dB), ``ssim``, ``lpips_alex`` or ``lpips_vgg``;
+            ``psnr_face``, ``ssim_hands`` and so on of crops; ``psnr_white_truth`` and so on of composites;
+            ``flicker`` (levels of 255); ``identity_distance``, ``identity_cosine``, ``identity_found``;
+            ``psnr_seen`` and ``psnr_unseen`` (dB) of surface that training frames show, or do not, and
+            ``unseen_share``, the latter's part of the person.
         value: as the metric is defined, not times 100.
+        view: empty for a camera of the training frames; else which other.
     """
 
     frame: int
@@ -51,6 +68,7 @@ class Score:
     method: str
     metric: str
     value: float
+    view: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,54 +118,155 @@ class Scorer:
         return self.picture(on(self.background), None if self.background == BLACK else on(BLACK))
 
     @torch.no_grad()
-    def values(self, picture: Picture, truth: Picture, interior: Tensor) -> dict[str, float]:
+    def values(self, picture: Picture, truth: Picture, interior: Tensor, person: Tensor) -> dict[str, float]:
         """Every metric of one picture.
 
         Args:
             picture: what is judged.
             truth: the person.
             interior: [H, W] bool, see :func:`pipeline.metrics.protocol.interior`.
+            person: [H, W] bool, the person's pixels.
 
         Returns:
-            Metric -> value; ``psnr_interior`` is NaN where the interior is empty.
+            Metric -> value; ``psnr_interior`` and ``psnr_person`` are NaN where there is no such pixel.
         """
         values = {
             "psnr": psnr(picture.image, truth.image),
             "psnr_interior": psnr(picture.black, truth.black, interior),
+            "psnr_person": psnr(picture.black, truth.black, person),
             "ssim": ssim(picture.image, truth.image, BACKGROUNDS[self.background]),
         }
-        for name, network in self.networks.items():
-            values[f"lpips_{name}"] = float(network.distance(picture.features[name], truth.features[name]))
-        return values
+        return {**values, **self._perceptual(picture, truth)}
+
+    def crops(self, picture: Picture, boxes: Iterable[Box]) -> list[Picture]:
+        """Parts of a picture, each made ready by itself."""
+        parts = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in boxes]
+        return [self.picture(picture.image[part], picture.black[part]) for part in parts]
+
+    @torch.no_grad()
+    def crop_values(self, region: str, crops: list[Picture], truths: list[Picture]) -> dict[str, float]:
+        """PSNR, SSIM and LPIPS of a region, the mean over its crops: ``psnr_face`` and so on."""
+        found = []
+        for crop, truth in zip(crops, truths, strict=True):
+            values = {
+                "psnr": psnr(crop.image, truth.image),
+                "ssim": ssim(crop.image, truth.image, BACKGROUNDS[self.background]),
+            }
+            found.append({**values, **self._perceptual(crop, truth)})
+        return {f"{name}_{region}": math.fsum(one[name] for one in found) / len(found) for name in found[0]}
+
+    def _perceptual(self, picture: Picture, truth: Picture) -> dict[str, float]:
+        return {
+            f"lpips_{name}": float(network.distance(picture.features[name], truth.features[name]))
+            for name, network in self.networks.items()
+        }
 
 
-def mean(scores: Iterable[Score], split: str, method: str, metric: str) -> float | None:
+def values_of(
+    scores: Iterable[Score], split: str, method: str, metric: str, view: str | None = None
+) -> list[tuple[int, float]]:
+    """Frame and value of a metric, in the order of the scores; what is not defined is left out.
+
+    Args:
+        scores: all of them.
+        split, method, metric: which.
+        view: of this camera alone; of all if None.
+    """
+    wanted = (split, method, metric)
+    rows = [one for one in scores if (one.split, one.method, one.metric) == wanted]
+    return [(one.frame, one.value) for one in rows if view in (None, one.view) and not math.isnan(one.value)]
+
+
+def mean(
+    scores: Iterable[Score], split: str, method: str, metric: str, view: str | None = None
+) -> float | None:
     """A metric's mean over a split's frames; None if no frame has it.
 
     Frames without an interior have no ``psnr_interior`` and are left out of its mean.
     """
-    wanted = (split, method, metric)
-    values = [one.value for one in scores if (one.split, one.method, one.metric) == wanted]
-    values = [value for value in values if not math.isnan(value)]
+    values = [value for _, value in values_of(scores, split, method, metric, view)]
     return math.fsum(values) / len(values) if values else None
 
 
-def table(scores: Iterable[Score], metrics: Iterable[str]) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The means, split -> method -> metric -> mean, rounded to 6 decimals; only what was scored."""
-    scores = list(scores)
+def further_metrics(scores: Iterable[Score], metrics: Iterable[str]) -> list[str]:
+    """The metrics that were measured besides those of the main table, sorted by name."""
+    return sorted({one.metric for one in scores} - set(metrics))
+
+
+def table(
+    scores: Iterable[Score], metrics: Iterable[str], view: str | None = None
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The means, split -> method -> metric -> mean, rounded to 6 decimals; only what was scored.
+
+    Of the metrics after the main table's, a method has those that it was measured in.
+    """
+    scores = [one for one in scores if view in (None, one.view)]
     result: dict[str, dict[str, dict[str, float | None]]] = {}
     metrics = list(metrics)
-    for split in (HELD_OUT, TRAINING):
+    for split in SPLITS:
         for method in METHODS:
-            if any(one.split == split and one.method == method for one in scores):
-                means = {metric: mean(scores, split, method, metric) for metric in metrics}
-                rounded = {name: None if value is None else round(value, 6) for name, value in means.items()}
-                result.setdefault(split, {})[method] = rounded
+            own = [one for one in scores if (one.split, one.method) == (split, method)]
+            measured = {one.metric for one in own}
+            names = [*(metrics if split != VIEWS else ()), *further_metrics(own, metrics)]
+            names += sorted(measured & set(metrics)) if split == VIEWS else []
+            if own:
+                means = {name: mean(own, split, method, name) for name in names}
+                result.setdefault(split, {})[method] = {
+                    name: _rounded(value) for name, value in means.items()
+                }
     return result
 
 
+Intervals = dict[str, dict[str, dict[str, list[float]]]]
+"""split -> method -> metric -> the interval's ends."""
+
+
+def intervals(scores: Iterable[Score], settings: EvaluateSettings) -> Intervals:
+    """Where each mean of the clip's own cameras would lie were the frames drawn anew."""
+    scores = [one for one in scores if one.split != VIEWS]
+    result: Intervals = {}
+    for split, method, metric in dict.fromkeys((one.split, one.method, one.metric) for one in scores):
+        found = _interval([value for _, value in values_of(scores, split, method, metric)], settings)
+        if found is not None:
+            ends = [round(found.low, 6), round(found.high, 6)]
+            result.setdefault(split, {}).setdefault(method, {})[metric] = ends
+    return result
+
+
+def differences(
+    scores: Iterable[Score], metrics: Iterable[str], settings: EvaluateSettings
+) -> dict[str, dict[str, dict[str, float]]]:
+    """What the avatar has over each other method on the held-out frames that both have, frame by frame.
+
+    Frames are hard or easy for all methods alike, so that differences are surer than means.
+
+    Returns:
+        method -> metric -> mean, low, high, of avatar minus method.
+    """
+    scores = list(scores)
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for method in (name for name in METHODS if name != AVATAR):
+        for metric in metrics:
+            own = dict(values_of(scores, HELD_OUT, AVATAR, metric))
+            other = values_of(scores, HELD_OUT, method, metric)
+            found = _interval([own[frame] - value for frame, value in other if frame in own], settings)
+            if found is not None:
+                ends = {name: round(value, 6) for name, value in dataclasses.asdict(found).items()}
+                result.setdefault(method, {})[metric] = ends
+    return result
+
+
+def _interval(values: list[float], settings: EvaluateSettings) -> Interval | None:
+    rounds, seed = settings.bootstrap_rounds, settings.bootstrap_seed
+    return interval(np.array(values, np.float64), rounds, seed, settings.confidence)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 6)
+
+
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
-    """Writes ``metrics.parquet``: frame int32, split, method, metric string, value float64.
+    """Writes ``metrics.parquet``: frame int32, split, method, metric string, value float64, view string.
 
     What is not defined (the interior of a frame that has none) has no row.
     """

@@ -4,9 +4,10 @@ import json
 
 import pytest
 
-from pipeline.compare import notes, table
+from pipeline.compare import notes, table, wanted
 from pipeline.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
 from pipeline.errors import UserError
+from pipeline.protocols import Protocol
 from pipeline.settings import Layer
 from pipeline.subjects import load_subject
 from pipeline.workspace import open_workspace
@@ -99,16 +100,17 @@ def test_the_row_of_the_datasets_own_protocol_is_marked():
     means = {"avatar": {"psnr": 20.0, "ssim": 0.9, "lpips_alex": 0.1}}
     refined = {**means, "avatar_refined": {"psnr": 25.0, "ssim": 0.9, "lpips_alex": 0.1}}
     found = {
-        "a": {"means": refined, "protocol": "on white, refined", "background": "white"},
-        "b": {"means": means, "protocol": "on black", "background": "black"},
+        "a": {"means": refined, "protocol": "white", "background": "white", "render_mask": "truth"},
+        "b": {"means": means, "protocol": "black", "background": "black", "render_mask": "own"},
     }
     rows = (Row("T", {"b": (1.0, 2.0, 3.0)}),)
-    as_neuman = Layer("x", {"evaluate": {"background": "white", "refine_test_poses": "on"}})
+    as_neuman = Layer("x", {"evaluate": {"protocol": "paper"}})
     about = Dataset("x", "X", "", "theirs", as_neuman, "", rows)
     said = notes(about, {name: (one, True) for name, one in found.items()})
     assert "The row to compare is 'here, test poses refined'" in said
     assert "Not comparable, test poses were not refined: b" in said
     assert "Not comparable, the published numbers are on white: b" in said
+    assert "Not comparable, the published numbers have the truth's mask on both pictures: b" in said
     text = table(about, ["a", "b"], found, said)
     assert "| **here, test poses refined** (1 of 2 subjects) | 25.00 / 0.900 / 10.00 | - |" in text
     assert "| here | 20.00" in text
@@ -120,10 +122,9 @@ def test_the_row_of_the_datasets_own_protocol_is_marked():
 
 def test_neuman_is_judged_as_its_paper_does():
     workspace = open_workspace()
-    tables = load_dataset(workspace, "neuman").layer.tables
-    assert tables["evaluate"] == {"background": "white", "refine_test_poses": "on"}
-    for name in ("talkshow", "zju"):
-        assert load_dataset(workspace, name).layer.tables["evaluate"] == {"background": "black"}
+    found = {name: wanted(load_dataset(workspace, name)) for name in ("neuman", "talkshow", "zju")}
+    assert found["neuman"] == Protocol("white", "truth", "on")
+    assert found["talkshow"] == found["zju"] == Protocol("black", "truth", "off")
 
 
 def test_a_dataset_without_published_numbers_has_a_table_too():

@@ -9,14 +9,18 @@ from pipeline.body import Poses, write_poses
 from pipeline.camera import facing_camera
 from pipeline.curves import Curve
 from pipeline.frames import write_frame, write_mask
+from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
 from pipeline.plan import write_plan
 from pipeline.records import Footage, Split, write_cameras, write_footage, write_json, write_split
 from pipeline.splat import Gaussians, render
 from pipeline.stage import Context
+from pipeline.tables import write_table
+from stages.evaluate.assessment import Extras
 from stages.evaluate.evidence import read_evidence
 from stages.evaluate.run import evaluate
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
+from stages.fit.residuals import SCHEMA as RESIDUALS
 from stages.train.gate import write_visibility
 from tests.plans import plan_of
 
@@ -63,7 +67,8 @@ class Clip:
     def context(self, name="out", **settings):
         output, work = self.root / name, self.root / f"{name}-work"
         output.mkdir()
-        settings = {"turntable_frames": 4, "turntable_width": 48, "turntable_height": 64, **settings}
+        small = {"turntable_frames": 4, "turntable_width": 48, "turntable_height": 64, "motion_frames": 4}
+        settings = {**small, **settings}
         return Context(
             subject="blob",
             settings=EvaluateSettings(lpips_networks=(), **settings),
@@ -77,11 +82,23 @@ class Clip:
             stage="evaluate",
         )
 
-    def evaluate(self, animate=stand_in, name="out", follow=None, **settings):
+    def evaluate(self, animate=stand_in, name="out", follow=None, extras=None, views=None, **settings):
         context = self.context(name, **settings)
-        scorer = Scorer({}, context.settings.background)
-        evaluate(context, read_evidence(self.inputs), animate, follow or animate, scorer)
+        scorer = Scorer({}, context.settings.choices.background)
+        extras = extras or Extras()
+        evaluate(context, read_evidence(self.inputs), animate, follow or animate, scorer, extras, views)
         return context.output
+
+
+def a_face_and_a_hand():
+    """Keypoints of a face 20 pixels wide about the picture's middle in all frames, and of a hand in one."""
+    keypoints = empty_keypoints(np.array(FRAMES))
+    spread = np.random.default_rng(0).uniform(-10, 10, (68, 2))
+    keypoints.whole_body[:, FACE, :2] = np.array([WIDTH / 2, HEIGHT / 2]) + spread
+    keypoints.whole_body[:, FACE, 2] = 0.9
+    keypoints.whole_body[FRAMES.index(TEST[0]), LEFT_HAND] = [30, 20, 0.8]
+    keypoints.whole_body[FRAMES.index(TEST[0]), LEFT_HAND, :2] += spread[:21]
+    return keypoints
 
 
 def make_clip(root, test=TEST, soft=False):
@@ -97,6 +114,7 @@ def make_clip(root, test=TEST, soft=False):
         color = rendering.color / rendering.alpha[..., None].clamp(min=1e-6) if soft else rendering.color
         write_frame(ingest / "frames", frame, (color.clamp(0, 1) * 255).round().byte().numpy())
         write_mask(ingest / "masks", frame, (alpha * 255).round().byte().numpy())
+    write_keypoints(ingest / "keypoints.parquet", a_face_and_a_hand())
     write_cameras(ingest / "cameras.parquet", dict.fromkeys(FRAMES, camera))
     write_split(ingest / "split.json", Split(tuple(f for f in FRAMES if f not in test), test))
     dropped = {"no person was found": 2, "unreadable": 0}
@@ -105,6 +123,9 @@ def make_clip(root, test=TEST, soft=False):
     write_footage(ingest / "footage.json", footage)
     write_poses(fit / "poses.parquet", poses)
     write_poses(train / "poses.parquet", poses)
+    errors = {"frame": np.array(FRAMES[:2], np.int32), "group": np.array(["body", "face"], dtype=object)}
+    pixels = {"point": np.zeros(2, np.int32), "pixels": np.array([1.0, 3.0], np.float32)}
+    write_table(fit / "residuals.parquet", RESIDUALS, errors | pixels)
     points = Curve()
     for iteration in (10, 20, 30):
         points.count({"l1": 1 / iteration, "ssim": 0.5 / iteration, "offset": 1e-3, "pose_offset": 1e-4})

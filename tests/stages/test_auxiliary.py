@@ -16,6 +16,7 @@ from pipeline.frames import read_frame, read_mask, write_frame, write_video
 from pipeline.keypoints import FACE, read_keypoints
 from pipeline.plan import write_plan
 from pipeline.records import read_cameras
+from pipeline.texture import Seen, robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary import texture
 from stages.auxiliary.accept import posed
@@ -26,7 +27,6 @@ from stages.auxiliary.reference import score_frames
 from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turn_keypoints
 from stages.auxiliary.texture.complete import membrane, neighbours
-from stages.auxiliary.texture.project import Seen, robust_mean, weighted_median
 from stages.auxiliary.texture.shade import shading
 from stages.auxiliary.turn import ID_OFFSET, make_turn
 from tests.plans import plan_of

@@ -51,7 +51,7 @@ def published(tmp_path_factory):
 
 def test_everything_named_is_published(published):
     names = {path.name for path in published.iterdir()}
-    pictures = {"comparison.png", "cover.png", "turntable.mp4"}
+    pictures = {"comparison.png", "cover.png", "turntable.mp4", "motion.mp4"}
     assert names == {"metrics.parquet", "summary.json", "report.html", "avatar.ply", *pictures}
 
 
@@ -75,10 +75,15 @@ def test_the_baselines_stand_beside_it(published):
 
 def test_every_frame_has_a_row(published):
     rows = pq.read_table(published / "metrics.parquet").to_pylist()
-    assert set(rows[0]) == {"frame", "split", "method", "metric", "value"}
+    assert set(rows[0]) == {"frame", "split", "method", "metric", "value", "view"}
     held_out = {(row["frame"], row["method"], row["metric"]) for row in rows if row["split"] == "test"}
-    metrics, methods = ("psnr", "psnr_interior", "ssim"), ("avatar", "mean_frame", "nearest_frame")
-    assert held_out == {(frame, method, metric) for frame in TEST for method in methods for metric in metrics}
+    metrics = ("psnr", "psnr_interior", "psnr_person", "ssim", "psnr_face", "ssim_face")
+    methods = ("avatar", "mean_frame", "nearest_frame")
+    expected = {(frame, method, metric) for frame in TEST for method in methods for metric in metrics}
+    expected |= {(frame, method, "flicker") for frame in TEST[1:] for method in methods}
+    expected |= {(TEST[0], method, f"{metric}_hands") for method in methods for metric in ("psnr", "ssim")}
+    cuts = [f"psnr_{background}_{mask}" for background in ("black", "white") for mask in ("own", "truth")]
+    assert held_out == expected | {(frame, "avatar", cut) for frame in TEST for cut in cuts}
     trained = {row["frame"] for row in rows if row["split"] == "train"}
     assert trained == set(evenly([frame for frame in FRAMES if frame not in TEST], 8))
 
@@ -153,7 +158,7 @@ def test_the_report_needs_nothing_but_itself(published):
     report = (published / "report.html").read_text()
     sources = re.findall(r'\b(?:src|href|poster|srcset|action|data)="([^"]*)"', report)
     assert sources and all(source.startswith(("data:", "#")) for source in sources)
-    assert not re.search(r"@import|<script|<link|<iframe|url\(\s*['\"]?(?!#)", report)
+    assert not re.search(r"@import|<script src|<link|<iframe|url\(\s*['\"]?(?!#)", report)
     assert "default-src 'none'" in report
 
 
@@ -161,8 +166,9 @@ def test_the_report_shows_what_it_must(published):
     report = (published / "report.html").read_text()
     summary = json.loads((published / "summary.json").read_text())
     assert f"{summary['means']['test']['avatar']['psnr']:.2f}" in report
-    assert report.count("<video") == 1 and "<svg" in report  # no overlay was published by this fit
-    assert report.count("ground truth, render, error × 3") == 3
+    assert report.count("<video") == 2 and "<svg" in report  # no overlay was published by this fit
+    assert report.count('class="row slide"') == 3 and report.count('class="row slide" data-said') == 3
+    assert all(sentence in report for sentence in summary["verdict"])
     for text in ("no person was found", "2 people were noticed", "10 of 50 body vertices", "avatar.ply"):
         assert text in report, text
     assert "evaluate.error_gain" in report and "unreadable" not in report
@@ -183,7 +189,8 @@ def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip
 def test_what_users_name_is_escaped(clip):
     context = dataclasses.replace(clip.context(), subject="<script>x</script>")
     evaluate(context, read_evidence(clip.inputs), stand_in, stand_in, Scorer({}))
-    assert "<script>" not in (context.output / "report.html").read_text()
+    report = (context.output / "report.html").read_text()
+    assert "<script>x" not in report and report.count("<script") == 1
 
 
 @pytest.mark.parametrize(("name", "kind"), [("overlay.mp4", "<video"), ("overlay.png", "<img")])
@@ -230,7 +237,7 @@ def test_the_terminal_summary_ends_with_the_reports_path(published):
     path = published / ("deep/" * 40) / "report.html"
     plain = summary_text(summary, path)
     assert plain.splitlines()[-1] == f"report: {path}"
-    assert "\x1b" not in plain and "nearest training frame" in plain and len(plain.splitlines()) < 12
+    assert "\x1b" not in plain and "nearest training frame" in plain and len(plain.splitlines()) < 16
     coloured = summary_text(summary, path, force_terminal=True, width=80)
     assert "\x1b[1m" in coloured and coloured.splitlines()[-1].endswith("report.html")
 
@@ -251,8 +258,8 @@ def test_the_path_is_where_the_store_will_publish(tmp_path):
         ({"turntable_width": 481}, "turntable_width must be even"),
         ({"training_frames": 0}, "training_frames must be at least 1"),
         ({"baseline_frames": -1}, "baseline_frames must be at least 0"),
-        ({"background": "grey"}, "background must be one of black, white, not grey"),
-        ({"refine_test_poses": "yes"}, "refine_test_poses must be one of auto, on, off"),
+        ({"background": "grey"}, "background must be one of auto, black, white, not grey"),
+        ({"refine_test_poses": "yes"}, "refine_test_poses must be one of auto, plan, on, off"),
         ({"refine_steps": 0}, "refine_steps must be at least 1"),
         ({"error_gain": 0.0}, "error_gain must be above 0"),
     ],
@@ -263,7 +270,10 @@ def test_settings_that_cannot_work_are_refused(settings, message):
 
 
 def test_the_stage_reads_what_it_declares():
-    assert STAGE.settings is EvaluateSettings and STAGE.assets == ("lpips",)
+    assert STAGE.settings is EvaluateSettings
+    assert STAGE.demands(EvaluateSettings()).assets == ("lpips", "mediapipe")
+    lean = EvaluateSettings(second_mask="edge", identity=True)
+    assert STAGE.demands(lean).assets == ("lpips", "dlib", "identity")
     assert set(STAGE.needs) == {"ingest", "fit", "plan", "train"}
 
 

@@ -11,12 +11,15 @@ import pytest
 import torch
 from rich.console import Console
 
+from pipeline import protocols
 from pipeline.body import read_poses, write_poses
 from pipeline.camera import project
 from pipeline.frames import read_mask, write_mask
+from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.metrics import BACKGROUNDS, psnr
 from pipeline.plan import write_plan
-from stages.evaluate import settings as evaluate_settings
+from pipeline.protocols import PROTOCOLS
+from pipeline.records import read_cameras
 from stages.evaluate.evidence import read_evidence
 from stages.evaluate.refinement import NONE, called_for, refine, refined_pose
 from stages.evaluate.rendering import follower, render_frame, scored_picture
@@ -209,6 +212,8 @@ def subject(tmp_path_factory):
     folder = tmp_path_factory.mktemp("body")
     write_subject(folder)
     (folder / "train").mkdir()
+    frames = np.array(sorted(read_cameras(folder / "ingest" / "cameras.parquet")))
+    write_keypoints(folder / "ingest" / "keypoints.parquet", empty_keypoints(frames))
     write_poses(folder / "train" / "poses.parquet", body_poses())
     return read_evidence({name: folder / name for name in ("ingest", "fit", "plan", "train")})
 
@@ -251,8 +256,8 @@ def test_a_perfect_pose_is_left_alone(subject):
 
 
 def test_the_protocol_names_what_was_done():
-    assert "refined" not in protocol("black", NONE)
+    assert "refined" not in protocol(PROTOCOLS["ours"], NONE)
 
 
 def test_the_setting_knows_every_background():
-    assert tuple(BACKGROUNDS) == evaluate_settings._BACKGROUNDS
+    assert tuple(BACKGROUNDS) == protocols.BACKGROUNDS

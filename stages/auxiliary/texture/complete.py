@@ -14,9 +14,8 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import cg, splu
 
-from stages.auxiliary.texture.project import Seen
+from pipeline.texture import FineSurface, Seen
 from stages.auxiliary.texture.shade import shading
-from stages.auxiliary.texture.surface import FineSurface
 
 _TOLERANCE, _ITERATIONS = 1e-3, 300
 _PULL = 1e-7  # towards the mean, so that a part without any known neighbour has an answer

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pipeline.body import rasterize
 from pipeline.camera import Camera
-from stages.auxiliary.texture.surface import FineSurface
+from pipeline.texture.surface import FineSurface
 
 SAMPLES = 2  # a pixel, in each direction
 

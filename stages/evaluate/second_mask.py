@@ -1,0 +1,125 @@
+"""The ceiling that mask noise sets: the true frame against itself under a second mask.
+
+An avatar is judged under one mask and cannot know it at its edges; two good masks of one frame differ
+there. What the truth itself scores when a second mask cuts it out is what a perfect avatar could expect.
+
+- ``edge``: the same mask, one pixel smaller. Needs nothing, and is kind: both masks make the same mistakes.
+- ``estimator``: MediaPipe's own, frame by frame. It has two segmentations, of its pose model and of its
+  selfie model, and the one that agrees better with the clip's masks is taken. The clip's masks are mostly
+  made of these two (``stages/ingest/masks.py``), so that this, too, is rather kind.
+- a folder: anybody's, as grey pictures whose names are the frames' numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from pipeline.detection.estimator import Estimator, estimator_scale, resize
+from pipeline.errors import UserError
+from stages.evaluate.evidence import Evidence, evenly
+from stages.evaluate.settings import EvaluateSettings
+
+if TYPE_CHECKING:
+    from pipeline.stage import Context
+
+SHORT_SIDE, LONG_SIDE = 400, 1920  # pixels that the estimator is shown, as by ingest's defaults
+_SEGMENTATIONS = ("body_mask", "selfie_mask")
+_NAMES = {"body_mask": "its pose model's segmentation", "selfie_mask": "its selfie segmentation"}
+
+
+@dataclasses.dataclass(frozen=True)
+class SecondMasks:
+    """A second opinion on some frames.
+
+    Attributes:
+        masks: frame -> [H, W] uint8, soft alpha.
+        source: whose they are, in a few words.
+    """
+
+    masks: Mapping[int, np.ndarray]
+    source: str
+
+
+NONE = SecondMasks({}, "")
+
+
+def second_masks(context: Context, evidence: Evidence) -> SecondMasks:
+    """The second masks of the held-out frames, as the settings say.
+
+    Raises:
+        UserError: the folder lacks a mask, or has one of another size.
+    """
+    settings: EvaluateSettings = context.settings
+    held_out = evidence.split.test
+    frames = evenly(held_out, settings.second_mask_frames or len(held_out))
+    if settings.second_mask == "off" or not frames:
+        return NONE
+    if settings.second_mask == "edge":
+        return SecondMasks({frame: edge(evidence.mask(frame)) for frame in frames}, "the same, 1 px smaller")
+    if settings.second_mask == "estimator":
+        estimator = Estimator(context.assets["mediapipe"], context.work / "mediapipe.log", still=True)
+        with context.progress(len(frames), "second masks") as progress:
+            return estimated(estimator, evidence, frames, progress.advance)
+    folder = Path(settings.second_mask)
+    return SecondMasks({frame: read_given(folder, evidence, frame) for frame in frames}, folder.name)
+
+
+def edge(mask: np.ndarray) -> np.ndarray:
+    """A mask whose outline lies one pixel further in, [H, W] uint8; the picture's border does not erode."""
+    return cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=255)
+
+
+def estimated(
+    estimator: Estimator, evidence: Evidence, frames: Sequence[int], advance: Callable[[], object]
+) -> SecondMasks:
+    """MediaPipe's masks of some frames; a frame in which it sees nobody has none."""
+    found: dict[str, dict[int, np.ndarray]] = {name: {} for name in _SEGMENTATIONS}
+    for frame in frames:
+        image = evidence.frame(frame)
+        height, width = image.shape[:2]
+        estimate = estimator.estimate(resize(image, estimator_scale(width, height, SHORT_SIDE, LONG_SIDE)))
+        for name in _SEGMENTATIONS if estimate is not None else ():
+            alpha = cv2.resize(getattr(estimate, name), (width, height), interpolation=cv2.INTER_AREA)
+            found[name][frame] = np.round(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
+        advance()
+    agreement = {name: mean_overlap(evidence, masks) for name, masks in found.items()}
+    best = max(_SEGMENTATIONS, key=lambda name: agreement[name])
+    if not found[best]:
+        return NONE
+    return SecondMasks(found[best], f"MediaPipe's, {_NAMES[best]}, overlap {agreement[best]:.3f}")
+
+
+def mean_overlap(evidence: Evidence, masks: Mapping[int, np.ndarray]) -> float:
+    """The mean intersection over union with the clip's masks, cut at one half; 0 without any."""
+    return float(np.mean([overlap(evidence.mask(frame), mask) for frame, mask in masks.items()] or [0.0]))
+
+
+def overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Intersection over union of two masks [H, W] uint8, cut at one half; 0 where both are empty."""
+    union = int(((first > 127) | (second > 127)).sum())
+    return int(((first > 127) & (second > 127)).sum()) / union if union else 0.0
+
+
+def read_given(folder: Path, evidence: Evidence, frame: int) -> np.ndarray:
+    """A mask that somebody else made, [H, W] uint8.
+
+    Raises:
+        UserError: there is none, or it has another size than the frame.
+    """
+    names = [f"{frame:06d}.png", f"{frame:05d}.png", f"{frame}.png"]
+    path = next((folder / name for name in names if (folder / name).is_file()), None)
+    if path is None:
+        raise UserError(f"evaluate.second_mask={folder}: there is no {names[0]} or {names[-1]} in it")
+    mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
+    expected = evidence.mask(frame).shape
+    if mask is None or mask.shape != expected:
+        raise UserError(
+            f"{path}: not a grey picture of {expected[1]} x {expected[0]} pixels, as the frame is"
+        )
+    return mask

@@ -1,0 +1,149 @@
+"""Whether the avatar is good and what limits it, in sentences made from the numbers.
+
+What limits it is told by decibels that one cause or another takes, each measured on this clip:
+
+- **masks**: the truth itself scores no more than the ceiling under a second mask;
+- **poses**: refining held-out poses on their own images gains so much;
+- **generalisation**: frames that were learnt from score so much more than held-out ones;
+- **face, hands**: their crops score so much less than the person as a whole.
+
+What the clip never showed of the body costs no held-out frame anything, and an avatar everything once it
+turns; it is said apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.plan import AZIMUTH_STEP
+from stages.evaluate.scoring import AVATAR, BASELINES, CEILING, HELD_OUT, MESH, NEAREST, REFINED, TRAINING
+
+CLEAR = 0.5  # dB under which a cause is not worth naming
+NEAR_CEILING = 1.5  # dB between avatar and ceiling, under which masks are what is measured
+PARTS = 3.0  # dB by which a part must be worse than the whole person to be named
+NAMED = 2  # causes
+
+_OVER = {NEAREST: "copying the nearest training frame", MESH: "the textured mesh"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sides:
+    """What the clip shows of the person.
+
+    Attributes:
+        unmodelled: the share of the body's vertices that carry no Gaussians.
+        azimuths: degrees of the directions from which no training frame saw the person; 0 is its front.
+        fit_pixels: mean reprojection error of the fit on trusted keypoints; None where not known.
+    """
+
+    unmodelled: float
+    azimuths: tuple[float, ...]
+    fit_pixels: float | None
+
+
+def verdict(summary: Mapping[str, Any], sides: Sides) -> list[str]:
+    """Two or three sentences.
+
+    Args:
+        summary: what ``summary.json`` holds.
+        sides: what the clip shows.
+    """
+    return [sentence for sentence in (quality(summary), limits(summary, sides), turned(sides)) if sentence]
+
+
+def quality(summary: Mapping[str, Any]) -> str:
+    """How good the avatar is on frames that it never saw, against what needs no avatar."""
+    means = summary["means"].get(HELD_OUT, {})
+    if AVATAR not in means:
+        psnr = summary["means"].get(TRAINING, {}).get(AVATAR, {}).get("psnr")
+        known = f": {psnr:.1f} dB on those it was trained on" if psnr is not None else ""
+        return f"No frame was held out, so nothing says how good it is on new ones{known}."
+    rival, gain = _rival(summary)
+    score = f"{means[AVATAR]['psnr']:.1f} dB on frames it never saw"
+    if rival is None or gain is None:
+        return f"{score[0].upper()}{score[1:]}."
+    span = f"{100 * summary['confidence']:.0f}% interval {gain['low']:+.1f} to {gain['high']:+.1f}"
+    if gain["low"] > 0:
+        verb = f"{gain['mean']:.1f} dB better than {_OVER[rival]} ({span})"
+    elif gain["high"] < 0:
+        verb = f"{-gain['mean']:.1f} dB worse than {_OVER[rival]} ({span})"
+    else:
+        verb = f"Level with {_OVER[rival]} ({gain['mean']:+.1f} dB, {span})"
+    return f"{verb}: {score}{_sharpness(means, rival)}."
+
+
+def limits(summary: Mapping[str, Any], sides: Sides) -> str:
+    """What takes the most decibels."""
+    found = causes(summary)
+    worth = sorted(((cost, text) for cost, text in found if cost >= CLEAR), reverse=True)[:NAMED]
+    fit = f" The fit is off by {sides.fit_pixels:.1f} px." if sides.fit_pixels is not None else ""
+    if worth:
+        return f"What limits it most: {'; then '.join(text for _, text in worth)}.{fit}"
+    return f"Nothing that was measured stands out as its limit.{fit}" if found else fit.strip()
+
+
+def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
+    """What each cause takes, dB, and says; only what was measured."""
+    means, found = summary["means"].get(HELD_OUT, {}), []
+    avatar = means.get(AVATAR, {}).get("psnr")
+    if avatar is None:
+        return []
+    ceiling = means.get(CEILING, {}).get("psnr")
+    if ceiling is not None:
+        margin = ceiling - avatar
+        text = f"masks (the truth itself scores {ceiling:.1f} dB under a second mask)"
+        # A score at the ceiling can hardly rise, whatever else is mended.
+        found.append((100.0 if margin < NEAR_CEILING else 0.0, text))
+    refined = means.get(REFINED, {}).get("psnr")
+    if refined is not None:
+        found.append((refined - avatar, f"poses (refining them gains {refined - avatar:.1f} dB)"))
+    trained = summary["means"].get(TRAINING, {}).get(AVATAR, {}).get("psnr")
+    if trained is not None:
+        text = f"new frames ({trained - avatar:.1f} dB below those it learnt from)"
+        found.append((trained - avatar, text))
+    whole = means[AVATAR].get("psnr_person")
+    for part in ("face", "hands"):
+        value = means[AVATAR].get(f"psnr_{part}")
+        if value is not None and whole is not None and whole - value > PARTS:
+            found.append(
+                (whole - value - PARTS, f"the {part} ({value:.1f} dB against {whole:.1f} of the person)")
+            )
+    return found
+
+
+def turned(sides: Sides) -> str:
+    """What one sees who turns it."""
+    hollow = f"{100 * sides.unmodelled:.0f}% of the body was hardly ever in the picture and has no Gaussians"
+    behind = [azimuth for azimuth in sides.azimuths if 90 < azimuth % 360 < 270]
+    if len(sides.azimuths) and behind:
+        count = f"{len(sides.azimuths)} of {360 // AZIMUTH_STEP} directions"
+        back = f"{count} were never filmed, the back among them: there it is a guess"
+        return f"Turned: {back}; {hollow}." if sides.unmodelled >= 0.01 else f"Turned: {back}."
+    return f"{hollow}." if sides.unmodelled >= 0.01 else ""
+
+
+def _rival(summary: Mapping[str, Any]) -> tuple[str | None, Mapping[str, float] | None]:
+    """The baseline that comes nearest to the avatar, and what the avatar has over it."""
+    over = summary["differences"]
+    known = [
+        (over[name]["psnr"]["mean"], name)
+        for name in BASELINES
+        if name in _OVER and "psnr" in over.get(name, {})
+    ]
+    if not known:
+        return None, None
+    name = min(known)[1]
+    return name, over[name]["psnr"]
+
+
+def _sharpness(means: Mapping[str, Any], rival: str) -> str:
+    """A remark where LPIPS says otherwise than PSNR."""
+    metric = next((name for name in means[AVATAR] if name in ("lpips_vgg", "lpips_alex")), None)
+    if metric is None or means[rival].get(metric) is None:
+        return ""
+    own, other = 100 * means[AVATAR][metric], 100 * means[rival][metric]
+    if own <= other:
+        return ""
+    return f", but less sharp (LPIPS x100 {own:.1f} against {other:.1f})"

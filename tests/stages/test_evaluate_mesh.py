@@ -1,0 +1,98 @@
+"""A painted body: its textured mesh, and cameras behind it that no training frame had."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body import load_body, mean_identity, write_identity, write_poses
+from pipeline.camera import Camera
+from pipeline.frames import write_frame, write_mask
+from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.metrics import interior, psnr
+from pipeline.records import write_cameras
+from pipeline.splat import render
+from stages.evaluate.baselines import mean_frame
+from stages.evaluate.evidence import read_evidence
+from stages.evaluate.mesh import textured_mesh
+from stages.evaluate.views import read_filmed, score_views
+from tests.stages.train_subject import BODY_FILE, moving_poses, painted_avatar, write_subject
+
+
+def behind(camera):
+    """The camera at the same distance on the other side of the body, upright."""
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # about the vertical through the world's origin
+    middle = torch.tensor([0.0, 0.0, -0.6])
+    rotation = camera.rotation @ turn
+    return Camera(camera.width, camera.height, camera.intrinsics, rotation, -rotation @ (2 * middle))
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    """The body of the train stage's tests, with the truth of its surface and a camera behind it."""
+    folder = tmp_path_factory.mktemp("body")
+    write_subject(folder)
+    ingest, avatar, poses = folder / "ingest", painted_avatar(), moving_poses()
+    (folder / "train").mkdir()
+    write_poses(folder / "train" / "poses.parquet", poses)
+    write_keypoints(ingest / "keypoints.parquet", empty_keypoints(np.arange(len(poses.frames))))
+    write_poses(ingest / "truth_poses.parquet", poses)
+    write_identity(ingest / "truth_surface.safetensors", avatar.identity, load_body(BODY_FILE))
+    evidence = read_evidence({name: folder / name for name in ("ingest", "fit", "plan", "train")})
+    view = ingest / "views" / "back"
+    for name in ("frames", "masks"):
+        (view / name).mkdir(parents=True)
+    camera = behind(evidence.cameras[0])
+    with torch.no_grad():
+        rendering = render(avatar.gaussians(*evidence.pose(0)), camera)
+    write_frame(view / "frames", 0, (rendering.color.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    write_mask(view / "masks", 0, (rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    write_cameras(view / "cameras.parquet", {0: camera})
+    return evidence, avatar
+
+
+def test_the_textured_mesh_comes_nearer_than_a_still(subject):
+    evidence, body = subject[0], load_body(BODY_FILE)
+    seen = []
+    mesh = textured_mesh(
+        evidence, body, mean_identity(body), evidence.split.train[::2], lambda: seen.append(1)
+    )
+    assert len(seen) == 3 and 0.02 < mesh.known < 0.5
+    held_out = evidence.split.test[0]
+    truth = evidence.person(held_out)
+    drawn = mesh.on(evidence.pose(held_out), evidence.cameras[held_out])("black")
+    still = mean_frame(evidence.person, evidence.split.train)
+    inside = interior(evidence.mask(held_out))
+    assert psnr(drawn, truth, inside) > psnr(still, truth, inside) + 3
+
+
+def test_what_no_training_frame_shows_is_told_apart(subject):
+    evidence, avatar = subject
+    body = load_body(BODY_FILE)
+    filmed = read_filmed(evidence, body)
+    assert 0.05 < filmed.seen.mean() < 0.6
+    # From the front nearly everything is seen, from behind hardly anything.
+    front = filmed.unseen_pixels(evidence.cameras[0], 0).sum()
+    back = filmed.unseen_pixels(behind(evidence.cameras[0]), 0).sum()
+    assert int(front) < 20 and int(back) > 200
+
+    def wrong_behind(rotation, expression, transl, time):
+        """The avatar that was filmed, in other colours where no frame showed it."""
+        gaussians = avatar.gaussians(rotation, expression, transl, time)
+        gaussians.colors[~torch.from_numpy(filmed.seen)] = 0.0
+        return gaussians
+
+    with torch.no_grad():
+        right, wrong = (
+            {one.metric: one.value for one in score_views(evidence, animate, None, filmed, "black")}
+            for animate in (avatar.gaussians, wrong_behind)
+        )
+    assert right["psnr_unseen"] > 40 and right["unseen_share"] > 0.5
+    assert wrong["psnr_unseen"] < 20 and wrong["psnr"] < right["psnr"] - 10
+
+
+def test_a_clip_without_truth_has_none(tmp_path, subject):
+    import dataclasses
+
+    bare = dataclasses.replace(subject[0], folder=tmp_path)
+    assert read_filmed(bare, load_body(BODY_FILE)) is None
+    assert score_views(bare, None, None, None, "black") == []
