@@ -307,7 +307,7 @@ class Avatar(nn.Module):
         return offset, 0.5 * geometry[:, 3:], color
 
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
-        """The centres, moved by what the residual heads say of them at rest, [N, 3]; as they are for [N, 0]."""
+        """The centres, moved by what the residual heads say at rest, [N, 3]; as they are for [N, 0]."""
         if not move.shape[1]:
             return means
         offset = move * self.architecture.pose_offset_unit
