@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from pipeline.artifact import RUN
 from pipeline.errors import UserError
 from pipeline.job import Job, job_from_words
 from pipeline.studies.design import (
@@ -52,6 +54,8 @@ def seconds_of(text: str) -> float:
 
 def spoken(seconds: float) -> str:
     """Seconds for people."""
+    if seconds >= 7200:
+        return f"{seconds / 3600:.1f} h"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
@@ -240,7 +244,8 @@ def expected_cost(explorer: Explorer, job: Job, base: Outcome) -> float:
     """
     own = explorer.job(base_of(explorer.knobs)).settings["train"]
     wanted, design = job.settings["train"], Design(explorer.knobs, explorer.made())
-    cost = cost_of(base) * wanted.iterations / own.iterations
+    moving = iterating(base)
+    cost = cost_of(base) - moving + moving * wanted.iterations / own.iterations
     for place, knob in enumerate(explorer.knobs):
         for level, one in enumerate(knob.levels):
             changed = explorer.job(_only(explorer.knobs, place, level)).settings["train"]
@@ -248,6 +253,13 @@ def expected_cost(explorer: Explorer, job: Job, base: Outcome) -> float:
             if level and name and getattr(changed, name) == getattr(wanted, name):
                 cost *= design.ratio(place, level, lambda made: made.cost, one.factor)
     return cost
+
+
+def iterating(outcome: Outcome) -> float:
+    """Processor seconds of the iterations alone; all of training's where they were not noted."""
+    record = json.loads((outcome.folders[TRAIN] / RUN).read_text(encoding="utf-8"))
+    marks = record["timings"].get("curve_seconds") or [(0, 0.0, cost_of(outcome))]
+    return float(marks[-1][2])
 
 
 def _only(knobs: Sequence[Knob], place: int, level: int) -> Point:

@@ -16,6 +16,7 @@ BLUE, ORANGE, GREY, INK = "#2f6fb3", "#c8641b", "#9aa3ab", "#22262a"
 LINES = ("#2f6fb3", "#c8641b", "#3f8f5f", "#8a5bb5", "#b5493f", "#6b7a86", "#b08a1e", "#2a9aa6")
 SIZE = (5.4, 4.2)  # inches: text stays legible on a phone
 DPI = 170
+REACH = 6.0  # times the dearest point, as far as a mark is drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ def scatter(
         path: the PNG.
         dots: the points.
         across, up: the axes.
-        marks: preset -> where it would lie across; of those whose quality is not known.
+        marks: preset -> where it would lie across, of those whose quality is not known; if near.
     """
     known = [dot for dot in dots if math.isfinite(dot.x) and math.isfinite(dot.y)]
     figure, axes = _figure(across, up)
@@ -68,7 +69,10 @@ def scatter(
         axes.plot(dot.x, dot.y, **_style(dot))
     edge = sorted((dot for dot in known if dot.on_frontier), key=lambda dot: dot.x)
     axes.plot([dot.x for dot in edge], [dot.y for dot in edge], color=BLUE, linewidth=1.4, zorder=2)
+    farthest = REACH * max((dot.x for dot in known), default=0.0)
     for name, x in (marks or {}).items():
+        if x > farthest:
+            continue
         axes.axvline(x, color=ORANGE, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
         axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, rotation=90, transform=_mixed(axes))
     _ticks(axes, across, up, known)
@@ -139,11 +143,13 @@ def _overlap(one: Box, other: Box) -> float:
 def _legend(axes: Axes, dots: Sequence[Dot]) -> None:
     from matplotlib.lines import Line2D
 
-    entries = [
-        Line2D([], [], marker="o", color=BLUE, linewidth=1.4, markersize=5.5, label="frontier"),
-        Line2D([], [], marker="o", color=GREY, linestyle="none", markersize=5.5, label="beaten"),
-        Line2D([], [], marker="D", color=INK, linestyle="none", markersize=7, label="base"),
-    ]
+    entries = [Line2D([], [], marker="o", color=BLUE, linewidth=1.4, markersize=5.5, label="frontier")]
+    if not all(dot.on_frontier for dot in dots):
+        entries.append(
+            Line2D([], [], marker="o", color=GREY, linestyle="none", markersize=5.5, label="beaten")
+        )
+    if any(dot.base and not dot.preset for dot in dots):
+        entries.append(Line2D([], [], marker="D", color=INK, linestyle="none", markersize=7, label="base"))
     for dot in dots:
         if dot.preset:
             label = f"preset {dot.preset}"
@@ -243,7 +249,7 @@ def _figure(across: Axis, up: Axis, size: tuple[float, float] = SIZE) -> tuple[F
 
 def _ticks(axes: Axes, across: Axis, up: Axis, dots: Sequence[Dot]) -> None:
     """Logarithmic axes with plain numbers on them, of which there are enough to read."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
     for axis, about, values in (
         (axes.xaxis, across, [dot.x for dot in dots]),
@@ -252,9 +258,23 @@ def _ticks(axes: Axes, across: Axis, up: Axis, dots: Sequence[Dot]) -> None:
         if not about.log or not values or min(values) <= 0:
             continue
         (axes.set_xscale if axis is axes.xaxis else axes.set_yscale)("log")
-        axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_major_locator(FixedLocator(plain_ticks(*axis.get_view_interval())))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axis.set_minor_formatter(NullFormatter())
+
+
+def plain_ticks(low: float, high: float, most: int = 7) -> list[float]:
+    """Round numbers in a range for a logarithmic axis: as many as fit, the roundest first."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ladders = ((1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9), (1, 1.5, 2, 3, 4, 6, 8), (1, 2, 3, 5), (1, 3), (1,))
+    ticks: list[float] = []
+    for ladder in ladders:
+        ticks = [step * 10.0**decade for decade in decades for step in ladder]
+        ticks = [tick for tick in ticks if low <= tick <= high]
+        if len(ticks) <= most:
+            break
+    return ticks
 
 
 def _mixed(axes: Axes):

@@ -267,6 +267,8 @@ def sentence(study: Study) -> str:
         for entry in alone
         if math.isfinite(entry.get("psnr")) and not study.by_chance(entry)
     ]
+    if not known:
+        return "The budget reached no setting but the study's own: give it more time."
     gaining = [one for one in known if one[1] > least]
     if not gaining:
         return (

@@ -118,17 +118,18 @@ def plots(folder: Path, study: Study) -> list[Picture]:
     """Draws every plot there is something for."""
     pictures = []
     for metric, label, file in (
-        ("psnr", "held-out PSNR, dB", "psnr_over_training.png"),
-        ("lpips_alex", "held-out LPIPS×100", "lpips_over_training.png"),
+        ("psnr", "Held-out PSNR, dB", "psnr_over_training.png"),
+        ("lpips_alex", "Held-out LPIPS×100", "lpips_over_training.png"),
     ):
         scatter(folder / file, dots(study, "train", metric), TRAIN_SECONDS, Axis(label), study.expected)
-        dashed = " Dashed: where a preset that was not run would lie." if study.expected else ""
-        pictures.append(Picture(folder / file, f"{label} against training. Numbers are the table's.{dashed}"))
+        dashed = " Dashed: what a preset that was not run would cost, if near." if study.expected else ""
+        told = f"{label.removesuffix(', dB')} against what training cost. Numbers are the table's.{dashed}"
+        pictures.append(Picture(folder / file, told))
     scatter(
         folder / "psnr_over_animation.png",
         dots(study, "animation_ms", "psnr"),
         ANIMATION,
-        Axis("held-out PSNR, dB"),
+        Axis("Held-out PSNR, dB"),
     )
     pictures.append(
         Picture(
@@ -168,12 +169,12 @@ def dots(study: Study, cost: str, metric: str) -> list[Dot]:
 
 
 def training_curves(study: Study) -> dict[str, list[tuple[float, float]]]:
-    """Label -> (wall-clock seconds, PSNR); the base and the frontier first.
+    """Label -> (wall-clock seconds, PSNR); the base and the frontier's best first.
 
     A curve is of pictures of its own run's size, so that runs of other sizes are left out.
     """
     edge, base = study.edge(), study.base.outcome
-    order = sorted(study.entries, key=lambda e: (e.number != 1, e.number not in edge, e.number))
+    order = sorted(study.entries, key=lambda e: (e.number != 1, e.number not in edge, -e.get("psnr")))
     return {
         f"{entry.number}. {entry.label}": curve_of(entry.outcome)
         for entry in order
@@ -196,8 +197,8 @@ def fit_plots(folder: Path, fits: Sequence[FitPoint]) -> list[Picture]:
     """Fit error against fit seconds: in pixels, and in millimetres where the truth is known."""
     pictures = []
     for name, label, file in (
-        ("pixels", "reprojection error, px", "fit_pixels.png"),
-        ("millimetres", "joints' distance from the truth, mm", "fit_millimetres.png"),
+        ("pixels", "Reprojection error, px", "fit_pixels.png"),
+        ("millimetres", "Joints' distance from the truth, mm", "fit_millimetres.png"),
     ):
         values = [getattr(fit, name) for fit in fits]
         if not any(math.isfinite(value) for value in values):
@@ -208,9 +209,8 @@ def fit_plots(folder: Path, fits: Sequence[FitPoint]) -> list[Picture]:
             for place, (fit, value) in enumerate(zip(fits, values, strict=True))
         ]
         scatter(folder / file, marks, Axis("seconds of registration", log=True), Axis(label))
-        pictures.append(
-            Picture(folder / file, f"{label} against the registration's seconds; numbers are steps.")
-        )
+        told = f"{label.partition(',')[0]} against the registration's seconds; numbers are steps."
+        pictures.append(Picture(folder / file, told))
     return pictures
 
 
@@ -221,9 +221,9 @@ def page(study: Study, tables: Sequence[Table], pictures: Sequence[Picture]) -> 
     outcomes = {f"{e.number}. {e.label}": e.outcome for e in study.entries if e.outcome}
     failed = [entry for entry in study.entries if entry.outcome is None]
     lines = [
-        f"{len(study.entries)} settings of {study.subject} within {spoken(study.budget)}: every level of "
-        "every knob alone, then the combinations that promised most for their time. Gains smaller than "
-        "another seed's difference mean nothing.",
+        f"Settings that were tried within {spoken(study.budget)}: {len(study.entries)}; each level of each "
+        "knob alone, then the combinations that promised most for their time. Gains smaller than another "
+        "seed's difference mean nothing.",
     ]
     if failed:
         lines.append(f"Failed: {', '.join(entry.label for entry in failed)}; the table says why.")
