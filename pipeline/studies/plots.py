@@ -99,8 +99,9 @@ def _numbers(axes: Axes, dots: Sequence[Dot]) -> None:
     scale = axes.figure.dpi / 72
     for dot, (x, y) in sorted(zip(dots, spots, strict=True), key=lambda pair: not pair[0].on_frontier):
         width, height = 5.2 * scale * len(str(dot.number)), 8 * scale
+        room = (7 if dot.base or dot.preset else 5) * scale
         best = min(
-            _around(x, y, width, height, scale), key=lambda box: sum(_overlap(box, one) for one in taken)
+            _around(x, y, width, height, room), key=lambda box: sum(_overlap(box, one) for one in taken)
         )
         taken.append(best)
         color = BLUE if dot.on_frontier else "#6b747c"
@@ -118,9 +119,8 @@ def _numbers(axes: Axes, dots: Sequence[Dot]) -> None:
 Box = tuple[float, float, float, float]
 
 
-def _around(x: float, y: float, width: float, height: float, scale: float) -> list[Box]:
+def _around(x: float, y: float, width: float, height: float, gap: float) -> list[Box]:
     """Boxes for a label around a spot: right, left, above, below, and the corners."""
-    gap = 5 * scale
     corners = [
         (x + gap, y - height / 2),
         (x - gap - width, y - height / 2),
