@@ -171,7 +171,7 @@ def speeds_of(
     from pipeline.studies.clip import speeds  # torch, which the DAG does without
     from pipeline.studies.measured import clip_of, notes_of
 
-    found = {}
+    found: dict[tuple[str, str], dict[str, float]] = {}
     for subject in dict.fromkeys(subject for subject, _ in endings):
         made = {key: one for key, one in endings.items() if key[0] == subject and isinstance(one, Outcome)}
         if not made:

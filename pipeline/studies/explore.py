@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.artifact import RUN
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
+from pipeline.job import Found, Job, job_from_words
 from pipeline.studies.design import (
     TRAIN,
     Design,
@@ -120,7 +120,8 @@ class Explorer:
 
     def needed(self, point: Point) -> list[str]:
         """The stages of a point that the store does not hold."""
-        job, found = self.job(point), {}
+        job = self.job(point)
+        found: Found = {}
         return [stage for stage in job.stages if job.find(stage, found) is None]
 
     def made(self) -> list[Made]:

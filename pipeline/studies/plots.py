@@ -108,7 +108,7 @@ def _numbers(axes: Axes, dots: Sequence[Dot]) -> None:
         weight = "bold" if dot.on_frontier else "normal"
         axes.annotate(
             str(dot.number),
-            axes.transData.inverted().transform((best[0], best[1])),
+            tuple(axes.transData.inverted().transform((best[0], best[1]))),
             color=color,
             fontsize=8,
             fontweight=weight,

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.job import DEFAULT_PRESET, job_from_words, workspace_from_words
 from pipeline.studies.design import Point, label_of, singles, words_of
@@ -23,6 +24,9 @@ from pipeline.studies.frontier import frontier, short_of
 from pipeline.studies.knobs import CHANCE, Knob, knobs_of
 from pipeline.studies.run import OWN_WORDS, Failure, base_words, study_folder
 from pipeline.study import Outcome
+
+if TYPE_CHECKING:
+    from pipeline.studies.clip import Clip
 
 QUALITY = ("psnr", "psnr_interior", "ssim", "lpips_alex")
 
@@ -169,10 +173,11 @@ class Judging:
     """Held-out quality at the base's picture size: evaluate's own numbers, measured here for other sizes."""
 
     def __init__(self, words: Mapping[str, str]) -> None:
-        self.words, self.base = words, None
-        self._clip = None
+        self.words = words
+        self.base: Outcome | None = None
+        self._clip: Clip | None = None
 
-    def clip(self, base: Outcome):
+    def clip(self, base: Outcome) -> Clip:
         """What avatars are measured on."""
         from pipeline.studies.measured import clip_of  # torch, which the DAG does without
 
@@ -182,13 +187,13 @@ class Judging:
 
     def qualities(self, outcome: Outcome) -> dict[str, float]:
         """Metric -> mean over the base's held-out frames."""
-        self.base = self.base or outcome
-        if outcome.folders["ingest"].name == self.base.folders["ingest"].name:
+        base = self.base = self.base or outcome
+        if outcome.folders["ingest"].name == base.folders["ingest"].name:
             return {metric: outcome.held_out(metric) for metric in QUALITY}
         from pipeline.studies.clip import quality, quality_name
         from pipeline.studies.measured import notes_of
 
-        clip = self.clip(self.base)
+        clip = self.clip(base)
         notes = notes_of(workspace_from_words(self.words), outcome.subject)
         return notes.once(quality_name(outcome, clip), lambda: quality(outcome, clip))
 
@@ -209,7 +214,7 @@ def gathered(
     explorer.say(f"timing {len(outcomes)} avatars in motion")
     notes = notes_of(workspace_from_words(words), explorer.subject)
     fast = speeds(outcomes, judge.clip(outcomes[0]), notes)
-    entries = []
+    entries: list[Entry] = []
     for point, ending in explorer.endings.items():
         label = label_of(explorer.knobs, point)
         entries.append(
@@ -288,7 +293,7 @@ def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = T
     knob = study.knobs[place]
     before, after = knob.levels[0].label, knob.levels[(entry.point or ())[place]].label
     if knob.name == "number of Gaussians" and entry.outcome and study.base.outcome:
-        before, after = (f"{one.outcome.gaussians:,} Gaussians" for one in (study.base, entry))
+        before, after = (f"{one.gaussians:,} Gaussians" for one in (study.base.outcome, entry.outcome))
     time = f"{ratio:.1f} times the training time" if abs(ratio - 1) > 0.05 else "no more training time"
     start = "Going from" if first else "going from"
     return f"{start} {before} to {after}, at {time}: {gain:+.1f} dB"
