@@ -10,6 +10,8 @@
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
     doit run animate subject=oliver motion=dance.bvh    the avatar in a motion that nobody filmed
+    doit run ablate subject=smile               what each part of the method is worth
+    doit run tradeoff subject=smile budget=20m  what accuracy costs in time
 
 What is stale is decided by the store (``pipeline.job``), never by doit's own database, which is not kept.
 """
@@ -19,6 +21,7 @@ from __future__ import annotations
 import functools
 import shutil
 import sys
+from collections.abc import Callable
 
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
@@ -283,3 +286,53 @@ def batch_subjects() -> TaskFailed | None:
 def task_batch():
     """Many subjects at once on a Ray cluster: cluster=auto, local or an address."""
     return {"actions": [(batch_subjects, [])]}
+
+
+def ablate_subjects() -> TaskFailed | None:
+    """Makes the ablation of each dataset, or of each subject."""
+    from pipeline.studies.ablation import ablate
+
+    named = "subject" not in WORDS and datasets(WORDS)
+    studies = (
+        [(name, subjects_of(WORKSPACE, name)) for name in named]
+        if named
+        else [(one, (one,)) for one in CHOSEN]
+    )
+    return each_study([functools.partial(ablate, name, subjects) for name, subjects in studies])
+
+
+def tradeoff_subjects() -> TaskFailed | None:
+    """Makes the study of what accuracy costs of each subject."""
+    from pipeline.studies.tradeoff import tradeoff
+
+    return each_study([functools.partial(tradeoff, subject) for subject in CHOSEN])
+
+
+def each_study(studies: list[Callable[[dict[str, str]], object]]) -> TaskFailed | None:
+    """Makes studies one after the other; one that fails does not stop the others."""
+    reasons = []
+    for study in studies:
+        try:
+            study(WORDS)
+        except (UserError, OSError) as error:
+            reasons.append(str(error))
+    return TaskFailed("; ".join(reasons)) if reasons else None
+
+
+def studied_assets() -> list[str]:
+    """The tasks that fetch what the chosen subjects' stages need, and what studies measure with."""
+    needed = {
+        "lpips",
+        *(asset for subject in CHOSEN for stage in STAGES for asset in needed_assets(stage, subject)),
+    }
+    return [f"assets:{name}" for name in sorted(needed & set(third_party.load_assets(WORKSPACE)))]
+
+
+def task_ablate():
+    """The paper's ablation tables of a subject or a dataset."""
+    return {"actions": [(ablate_subjects, [])], "task_dep": studied_assets()}
+
+
+def task_tradeoff():
+    """What accuracy costs in time: budget=20m, and any settings to start from."""
+    return {"actions": [(tradeoff_subjects, [])], "task_dep": studied_assets()}

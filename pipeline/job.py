@@ -25,8 +25,9 @@ from pipeline.workspace import Workspace, open_workspace
 
 # Words of the command line that are no stage's settings.
 PLACES = ("data", "artifacts", "assets", "body", "stages")
-WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", "verify", *PLACES)
 OF_ONE_SUBJECT = ("source", "dataset")
+STUDIES = ("budget", "scale")  # for pipeline.studies alone
+WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", "verify", *STUDIES, *PLACES)
 NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
 DEFAULT_PRESET = "quick"
 

@@ -24,8 +24,16 @@ def stage_command(stage: str, subject: str, words: Mapping[str, str]) -> list[st
     return [sys.executable, "-m", "pipeline.stage", stage, "--subject", subject, *pairs]
 
 
-def run_stage_process(stage: str, subject: str, words: Mapping[str, str]) -> str | None:
+def run_stage_process(
+    stage: str, subject: str, words: Mapping[str, str], log: Path | None = None
+) -> str | None:
     """Runs a stage in a process that writes to this terminal and ends with this one.
+
+    Args:
+        stage: its name.
+        subject: whose.
+        words: of the command line.
+        log: a file that gets the stage's lines in place of this terminal.
 
     Returns:
         Why it failed, in a line; None where it did not.
@@ -35,12 +43,17 @@ def run_stage_process(stage: str, subject: str, words: Mapping[str, str]) -> str
         environment = {**process_environment(), REASON: str(reason)}
         command = stage_command(stage, subject, words)
         prepare = functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
-        status = subprocess.run(command, env=environment, check=False, preexec_fn=prepare).returncode
+        with contextlib.ExitStack() as stack:
+            out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
+            status = subprocess.run(
+                command, env=environment, stdout=out, stderr=out, check=False, preexec_fn=prepare
+            ).returncode
         said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
     if status < 0:
         return killed_by(-status)
     if status:
-        return said or f"stopped with status {status}; its own lines above say why"
+        where = "its own lines above say why" if log is None else f"{log} says why"
+        return said or f"stopped with status {status}; {where}"
     return None
 
 

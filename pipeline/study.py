@@ -11,16 +11,15 @@ import contextlib
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline.artifact import RUN, Artifact
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
-from pipeline.stage import process_environment, usual
+from pipeline.job import Job, job_from_words, words_to_dict
+from pipeline.process import run_stage_process
+from pipeline.stage import usual
 
 SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
 
@@ -62,7 +61,7 @@ class Outcome:
 
     def held_out(self, metric: str, method: str = "avatar") -> float:
         """A metric's mean over the held-out frames."""
-        value = self.means["test"][method][metric]
+        value = self.means.get("test", {}).get(method, {}).get(metric)
         return float("nan") if value is None else float(value)
 
 
@@ -114,27 +113,36 @@ def made(job: Job, stages: Iterable[str] | None = None, log: Path | None = None)
 def _read(subject: str, variant: Variant, artifacts: Mapping[str, Artifact]) -> Outcome:
     folders = {stage: artifact.folder for stage, artifact in artifacts.items()}
     records = {stage: json.loads((folder / RUN).read_text()) for stage, folder in folders.items()}
-    summary = json.loads((folders["evaluate"] / SUMMARY).read_text())
+    summary = _summary(folders.get("evaluate"))
     return Outcome(
         subject=subject,
         variant=variant.name,
         means=summary["means"],
         gaussians=summary["gaussians"],
         seconds={stage: record["seconds"] for stage, record in records.items()},
-        cpu_seconds={stage: record.get("cpu_seconds", float("nan")) for stage, record in records.items()},
+        cpu_seconds={stage: _cpu_seconds(record) for stage, record in records.items()},
         folders=folders,
     )
 
 
+def _summary(folder: Path | None) -> dict[str, Any]:
+    """What evaluate published; nothing where there is no such stage."""
+    if folder is None:
+        return {"means": {}, "gaussians": 0}
+    return json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+
+
+def _cpu_seconds(record: Mapping[str, Any]) -> float:
+    """Of a run and of those that were killed before it, up to the checkpoint that it went on from."""
+    earlier = record.get("timings", {}).get("earlier_cpu_seconds", 0.0)
+    return record.get("cpu_seconds", float("nan")) + earlier
+
+
 def _run(job: Job, stage: str, log: Path | None) -> None:
     """Runs one stage in a process of its own."""
-    command = [sys.executable, "-m", "pipeline.stage", stage, "--subject", job.subject.name, *job.words]
-    with contextlib.ExitStack() as stack:
-        output = stack.enter_context(log.open("a")) if log is not None else None
-        done = subprocess.run(command, env=process_environment(), stdout=output, stderr=output, check=False)
-    if done.returncode:
-        told = f"; {log} says why" if log is not None else "; its own line above says why"
-        raise UserError(f"{stage}:{job.subject.name} stopped{told}")
+    reason = run_stage_process(stage, job.subject.name, words_to_dict(job.words), log)
+    if reason:
+        raise UserError(f"{stage}:{job.subject.name} {reason}")
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ class Architecture:
         residual_parts: parts that have a residual colour head, if any of their vertices is kept.
         residual_width: hidden channels of those heads.
         residual_place: which place they are told, ``"canonical"`` or ``"posed"`` (see ``residual.py``).
+        residual_moves: whether they move Gaussians, too: the ablation of the paper's supplement E.3.
         place_frequencies, time_frequencies: of the encodings of that place and of the time.
         pose_heads: whether there are any; one who never moves needs none.
     """
@@ -42,3 +43,4 @@ class Architecture:
     place_frequencies: int = 6
     time_frequencies: int = 6
     pose_heads: bool = True
+    residual_moves: bool = False

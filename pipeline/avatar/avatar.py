@@ -156,6 +156,7 @@ class Avatar(nn.Module):
                 pose,
                 sizes.residual_width,
                 sizes.groups,
+                sizes.residual_moves,
             )
 
     def __len__(self) -> int:
@@ -279,7 +280,8 @@ class Avatar(nn.Module):
         means = _transform(blended, shape) + transl
         if self.residuals_active and decoded.surface.residual:
             with self._autocast():
-                residual = self.residuals(decoded.surface.residual, means, theta, time, rows)
+                answer = self.residuals(decoded.surface.residual, means, theta, time, rows)
+            residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
@@ -305,6 +307,13 @@ class Avatar(nn.Module):
             geometry, color = put(geometry, rows, count), put(color, rows, count)
         offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
         return offset, 0.5 * geometry[:, 3:], color
+
+    def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
+        """The centres, moved by what the residual heads say at rest, [N, 3]; as they are for [N, 0]."""
+        if not move.shape[1]:
+            return means
+        offset = move * self.architecture.pose_offset_unit
+        return means + (blended[..., :3] * offset[:, None, :]).sum(-1)
 
     def _opacities(self, canonical: Canonical) -> Tensor:
         return torch.full((len(canonical),), self.architecture.opacity, device=self.device)

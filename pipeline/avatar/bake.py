@@ -29,7 +29,8 @@ from pipeline.splat import Gaussians
 
 FORMAT = "flexiavatar-baked-1"
 HEADS = ("geometry", "color")
-PLAIN = ("opacity", "place_frequencies", "time_frequencies", "posed_place")  # fields that JSON holds
+# Fields that JSON holds.
+PLAIN = ("opacity", "place_frequencies", "time_frequencies", "posed_place", "residual_unit")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,6 +108,7 @@ class BakedAvatar:
         time_range: [2], seconds of the first and the last training frame.
         place_frequencies, time_frequencies: of the residuals' encodings.
         posed_place: whether the residuals are told posed centres: then nothing of them is baked.
+        residual_unit: metres that a residual head's move of 1 stands for; 0 where they move nothing.
     """
 
     constants: Constants
@@ -120,6 +122,7 @@ class BakedAvatar:
     place_frequencies: int
     time_frequencies: int
     posed_place: bool
+    residual_unit: float = 0.0
 
     def __len__(self) -> int:
         """The number of Gaussians."""
@@ -154,12 +157,19 @@ class BakedAvatar:
             log_scale = log_scale + 0.5 * change[:, 3:]
             color_logit = color_logit + self.color(theta, normals)
         means, quaternions = self.rig.place(transforms, points, transl)
+        answers = self._residuals(means, theta, time)
+        if self.residual_unit:
+            for rows, answer in answers:
+                points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
+            means, quaternions = self.rig.place(transforms, points, transl)
+        for rows, answer in answers:
+            color_logit = color_logit.index_add(0, rows, answer[:, :3])
         scales = constants.scales * log_scale.clamp(*LOG_SCALE_RANGE).exp_()
         return Gaussians(
             means=means,
             quaternions=quaternions,
             scales=scales.clamp_(max=LARGEST_SCALE),
-            colors=self._with_residuals(color_logit, means, theta, time).sigmoid(),
+            colors=color_logit.sigmoid(),
             opacities=torch.full((len(points),), self.opacity),
         )
 
@@ -173,14 +183,16 @@ class BakedAvatar:
         pose = (roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)).flatten()
         return points + (constants.correctives @ pose.to(constants.correctives.dtype)).float()
 
-    def _with_residuals(self, logits: Tensor, means: Tensor, theta: Tensor, time: float | None) -> Tensor:
+    def _residuals(self, means: Tensor, theta: Tensor, time: float | None) -> list[tuple[Tensor, Tensor]]:
+        """Each part's rows and what its head says of them, [M, 3] logits or [M, 6] with moves."""
         if not self.residuals:
-            return logits
+            return []
         condition = torch.cat([time_code(time, self.time_range, self.time_frequencies), theta])
+        answers = []
         for part in self.residuals.values():
             own = encode(means[part.rows], self.place_frequencies) if self.posed_place else None
-            logits = logits.index_add(0, part.rows, part.head(condition, own))
-        return logits
+            answers.append((part.rows, part.head(condition, own)))
+        return answers
 
 
 @torch.no_grad()
@@ -218,6 +230,7 @@ def bake(avatar: Avatar) -> BakedAvatar:
         place_frequencies=networks.place_frequencies,
         time_frequencies=networks.time_frequencies,
         posed_place=posed,
+        residual_unit=avatar.architecture.pose_offset_unit if residuals and networks.outputs > 3 else 0.0,
     )
 
 
@@ -268,7 +281,7 @@ def save_baked(path: Path, baked: BakedAvatar) -> None:
         "format": FORMAT,
         "parents": baked.parents,
         "groups": {name: head.layers.groups for name, head in heads.items()},
-        **{name: getattr(baked, name) for name in PLAIN},
+        **{name: getattr(baked, name) for name in PLAIN if name != "residual_unit" or baked.residual_unit},
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     save_file(
@@ -304,7 +317,7 @@ def load_baked(path: Path) -> BakedAvatar:
             part: BakedResidual(tensors[f"residual.{part}.rows"], heads[f"residual.{part}"]) for part in parts
         },
         time_range=tensors["time_range"],
-        **{name: header[name] for name in PLAIN},
+        **{name: header[name] for name in PLAIN if name in header},
     )
 
 

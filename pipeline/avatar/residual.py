@@ -1,7 +1,9 @@
 """Part-specific residual colours: face, left hand, right hand (the paper's Section 3.5, Equation 7).
 
 A small head a part is told where a Gaussian lies, when the picture was taken and the pose, and adds
-what it knows to the colour. It never moves a Gaussian: the paper's ablation loses 0.6 dB by it.
+what it knows to the colour. It does not move a Gaussian: the paper's ablation loses 0.6 dB by it
+(supplement E.3, Table A4). ``residual_moves`` is that ablation: three more outputs a head, an
+offset of the centre that no regulariser holds.
 
 What the paper leaves open, and what is done here:
 
@@ -138,6 +140,7 @@ class Residuals(nn.Module):
         pose: int,
         width: int,
         groups: int,
+        moves: bool = False,
     ):
         """Heads that add nothing yet.
 
@@ -148,6 +151,7 @@ class Residuals(nn.Module):
             pose: length of theta.
             width: hidden channels.
             groups: of GroupNorm.
+            moves: whether they move Gaussians, too.
 
         Raises:
             ValueError: there is no such place.
@@ -156,10 +160,14 @@ class Residuals(nn.Module):
         if place not in PLACES:
             raise ValueError(f"a residual's place is one of {', '.join(PLACES)}, not {place}")
         self.place, (self.place_frequencies, self.time_frequencies) = place, frequencies
+        self.outputs = 6 if moves else 3
         inputs, condition = 3 * (1 + 2 * self.place_frequencies), 1 + 2 * self.time_frequencies + pose
         self.heads = nn.ModuleDict(
             {part: Head(inputs, 3, condition=condition, width=width, groups=groups) for part in parts}
         )
+        for head in self.heads.values() if moves else ():
+            # Afterwards, so that all other weights are those of heads that move nothing.
+            head.last = zero_layer(width, self.outputs)
         self.register_buffer("time_range", torch.tensor([0.0, 1.0]))
 
     def time_code(self, time: float | None) -> Tensor:
@@ -174,7 +182,9 @@ class Residuals(nn.Module):
         time: float | None,
         asked: Tensor | None = None,
     ) -> Tensor:
-        """Delta C_res of every Gaussian, zero where there is no head: [N, 3] logits.
+        """Delta C_res of every Gaussian in logits, zero where there is no head: [N, 3].
+
+        Where residuals move Gaussians, too: [N, 6], the last three in ``pose_offset_unit`` at rest.
 
         Args:
             places: the level's regions.
@@ -187,14 +197,22 @@ class Residuals(nn.Module):
             wanted = means.new_zeros(len(means), dtype=torch.bool).index_fill_(0, asked, True)
             places = tuple(_some(region, wanted) for region in places)
         condition = torch.cat([self.time_code(time), theta])
-        change = torch.zeros(len(means), 3, device=means.device)
+        change = torch.zeros(len(means), self.outputs, device=means.device)
         for region in places:
             encoded = region.encoded
             if self.place == "posed":
                 encoded = encode(means[region.rows].detach(), self.place_frequencies)
-            color = self.heads[region.part](encoded, condition).float()
-            change = change.index_copy(0, region.rows, color)
+            answer = self.heads[region.part](encoded, condition).float()
+            change = change.index_copy(0, region.rows, answer)
         return change
+
+
+def zero_layer(inputs: int, outputs: int) -> nn.Linear:
+    """A last layer that says nothing yet."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 def _some(region: Region, wanted: Tensor) -> Region:

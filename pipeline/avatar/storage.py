@@ -39,7 +39,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     header = {
         "format": FORMAT,
         "body": avatar.body_digest,
-        "architecture": dataclasses.asdict(avatar.architecture),
+        "architecture": _described(avatar.architecture),
         "half_precision": avatar.half_precision,
         "pose_heads_active": avatar.pose_heads_active,
         "residuals_active": avatar.residuals_active,
@@ -48,6 +48,14 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
+
+
+def _described(architecture: Architecture) -> dict:
+    """The sizes as JSON values; what an ablation alone asks for is written only where it was asked for."""
+    sizes = dataclasses.asdict(architecture)
+    if not architecture.residual_moves:
+        del sizes["residual_moves"]
+    return sizes
 
 
 def load_avatar(path: Path, body: BodyModel) -> Avatar:

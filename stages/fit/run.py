@@ -47,9 +47,10 @@ def _run(context: Context) -> None:
     ingest = context.inputs["ingest"]
     body = load_body(context.body_file)
     cameras = read_cameras(ingest / "cameras.parquet")
-    start = time.monotonic()
+    start, cpu = time.monotonic(), time.process_time()
     fitted = fit_clip(context, body, cameras)
     context.timing("registration_seconds", round(time.monotonic() - start, 2))
+    context.timing("registration_cpu_seconds", round(time.process_time() - cpu, 2))
     context.timing("curve_seconds", [[step, round(at, 3)] for step, at in fitted.seconds])
     means = group_means(fitted.error, fitted.observations)
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())

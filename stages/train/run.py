@@ -23,6 +23,7 @@ from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
+from stages.train.clock import Clock
 from stages.train.costs import saved
 from stages.train.data import Frames, spread
 from stages.train.gate import Gate, write_ungated
@@ -220,22 +221,36 @@ def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
-    started, first = time.monotonic(), trainer.iteration
+    clock, first = Clock(context.work, trainer.iteration), trainer.iteration
     with context.progress(settings.iterations, "training") as progress:
         progress.advance(trainer.iteration)
         while trainer.iteration < settings.iterations:
             values = trainer.step()
             last = trainer.iteration == settings.iterations
             if last or trainer.iteration % settings.held_out_every == 0:
-                held_out = trainer.held_out(inputs.whole, shown) if shown else None
+                clock.mark(trainer.iteration)
+                with clock.aside():
+                    held_out = trainer.held_out(inputs.whole, shown) if shown else None
                 trainer.curve.point(trainer.iteration, point_values(trainer, held_out))
                 report(trainer.iteration, values, held_out, context)
             if not last and trainer.iteration % settings.checkpoint_every == 0:
                 write_checkpoint(context.work, trainer.checkpoint(key))
+                clock.save(trainer.iteration)
             progress.advance(1, describe(values))
-    done = trainer.iteration - first
-    context.timing("train_seconds", time.monotonic() - started)
-    context.timing("milliseconds_an_iteration", 1e3 * (time.monotonic() - started) / max(1, done))
+    note_time(clock, first, trainer.iteration, context)
+
+
+def note_time(clock: Clock, first: int, last: int, context: Context) -> None:
+    """What the iterations took, for run.json: all of them, and each of this process's.
+
+    ``curve_seconds`` has iteration, wall-clock and processor seconds of each point of the curve.
+    """
+    _, wall, _ = clock.now(last)
+    context.timing("train_seconds", wall)
+    context.timing("milliseconds_an_iteration", 1e3 * (wall - clock.earlier[1]) / max(1, last - first))
+    context.timing("curve_seconds", clock.marks)
+    context.timing("earlier_seconds", clock.earlier[1])
+    context.timing("earlier_cpu_seconds", clock.earlier[2])
 
 
 def resume(trainer: Trainer, work: Path, key: str, context: Context) -> None:

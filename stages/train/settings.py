@@ -83,6 +83,7 @@ class TrainSettings:
 
     # Residual colours (Section 3.5). A part that the plan does not name gets no head.
     residual_parts: tuple[str, ...] = ("face", "left_hand", "right_hand")  # "rest": the authors' fourth net
+    residual_moves: bool = False  # move Gaussians, too: the ablation of the paper's supplement E.3
     residual_from: float = 0.5  # fraction of the run from which the residual heads take part; 1: never
     residual_width: int = 64  # hidden channels; the authors' release has 256
     residual_place: str = "canonical"  # what they are told of a Gaussian's place; "posed": in the world

@@ -103,11 +103,16 @@ def test_killed_and_rerun_gives_the_same_bytes(subject, finished, tmp_path, monk
     assert not list(context.output.iterdir())
     assert (context.work / NAME).exists()
     monkeypatch.undo()
-    messages = []
-    context.log = messages.append
+    messages, timings = [], {}
+    context.log, context.timing = messages.append, timings.__setitem__
     stage.run(context)
     assert any("goes on from iteration 5" in message for message in messages)
     assert bytes_of(context.output) == bytes_of(finished)
+    # What the killed process took up to its checkpoint is not forgotten.
+    iterations, wall, cpu = zip(*timings["curve_seconds"], strict=True)
+    assert iterations == (6, 12) and sorted(wall) == list(wall) and sorted(cpu) == list(cpu)
+    assert 0 < timings["earlier_seconds"] < wall[0] and 0 < timings["earlier_cpu_seconds"] < cpu[0]
+    assert timings["train_seconds"] >= wall[-1]
 
 
 def test_checkpoint_of_another_run_is_left_alone(tmp_path):

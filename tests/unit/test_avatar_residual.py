@@ -172,3 +172,65 @@ def test_saved_residuals_are_read_back(tmp_path, body, kept):
 def test_settings_know_the_parts_and_places():
     assert set(train_settings.PARTS) == {*PARTS, REST}
     assert train_settings.PLACES == PLACES
+
+
+def test_positions_move_only_where_residuals_are_told_to_move_them(body, kept):
+    avatar = made(body, kept, residual_moves=True)
+    refined = avatar.surfaces[-1].canonical.is_part(*REFINED)
+    with torch.no_grad():
+        posed = avatar.pose(avatar.decode(), *a_pose(), time=3.0).gaussians
+        avatar.residuals_active = False
+        without = avatar.pose(avatar.decode(), *a_pose(), time=3.0).gaussians
+    moved = (posed.means != without.means).any(1)
+    assert torch.equal(moved, refined)
+    assert (posed.means - without.means).norm(dim=1).max() < 0.1  # metres
+    for name in ("quaternions", "scales", "opacities"):
+        assert torch.equal(getattr(posed, name), getattr(without, name)), name
+
+
+def test_moves_are_at_rest_and_turn_with_the_body(body, kept):
+    avatar, (_, expression, transl) = made(body, kept, residual_moves=True), a_pose()
+    turns = [torch.zeros(55, 3) for _ in range(2)]
+    turns[1][0, 1] = torch.pi / 2  # the whole body, which the heads are not told
+    moves = []
+    for rotation in turns:
+        with torch.no_grad():
+            avatar.residuals_active = True
+            there = avatar.gaussians(rotation, expression, transl, 3.0).means
+            avatar.residuals_active = False
+            moves.append(there - avatar.gaussians(rotation, expression, transl, 3.0).means)
+    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # about Y
+    torch.testing.assert_close(moves[1], moves[0] @ quarter.T, rtol=0, atol=1e-6)
+
+
+def test_gradients_of_place_reach_exactly_the_parameters_of_moves(body, kept):
+    avatar = made(body, kept, residual_moves=True).train()
+    posed = avatar.pose(avatar.decode(), *a_pose(), time=3.0)
+    moved = posed.gaussians.means.square().sum()
+    residual = {name: one for name, one in avatar.named_parameters() if name.startswith("residuals.")}
+    found = dict(zip(residual, torch.autograd.grad(moved, residual.values(), retain_graph=True), strict=True))
+    for name, gradient in found.items():
+        if ".last." in name:  # rows 0 to 2 are colours, 3 to 5 moves
+            assert not bool(gradient[:3].any()) and bool((gradient[3:] != 0).any()), name
+        else:
+            assert bool((gradient != 0).any()), name
+    colors = torch.autograd.grad(posed.gaussians.colors.sum(), residual.values())
+    last = [one for name, one in zip(residual, colors, strict=True) if ".last." in name]
+    assert all(bool((one[:3] != 0).any()) and not bool(one[3:].any()) for one in last)
+
+
+def test_an_avatar_without_moves_has_the_weights_and_the_file_that_it_had(tmp_path, body, kept):
+    plain, moving = made(body, kept, awake=False), made(body, kept, awake=False, residual_moves=True)
+    pairs = dict(moving.named_parameters())
+    for name, parameter in plain.named_parameters():
+        if ".last." not in name:
+            assert torch.equal(parameter, pairs[name]), name
+    for mine, theirs in zip(
+        plain.gaussians(*a_pose(), 3.0).tensors(), moving.gaussians(*a_pose(), 3.0).tensors(), strict=True
+    ):
+        assert torch.equal(mine, theirs)
+    for avatar, named in ((plain, False), (moving, True)):
+        path = tmp_path / "avatar.safetensors"
+        save_avatar(path, avatar)
+        assert (b"residual_moves" in path.read_bytes()) == named
+        assert load_avatar(path, body).architecture == avatar.architecture

@@ -82,6 +82,22 @@ def test_baked_residual_colours_follow_the_time(body, place):
     assert (colors[0] - colors[1]).abs().max() > 1e-4
 
 
+@pytest.mark.parametrize("place", ["canonical", "posed"])
+def test_baked_residuals_move_what_the_avatars_move(body, place, tmp_path):
+    sizes = dataclasses.replace(
+        WITH_RESIDUALS, residual_moves=True, residual_place=place, place_frequencies=2
+    )
+    avatar = an_avatar(body, sizes)
+    baked = bake(avatar)
+    for time in (None, 1.3):
+        assert_same(avatar, baked, 1e-4, time=time)
+    save_baked(tmp_path / "baked.safetensors", baked)
+    assert_same(avatar, load_baked(tmp_path / "baked.safetensors"), 1e-4, time=1.3)
+    avatar.residuals_active = False
+    unmoved = avatar.gaussians(*a_pose()).means
+    assert (baked.gaussians(*a_pose()).means - unmoved).norm(dim=1).max() > 1e-4
+
+
 def test_baked_pose_correctives_are_as_good_as_exact(body):
     generator = torch.Generator().manual_seed(2)
     directions = 1e-3 * torch.randn(len(body.v_template), 3, 486, generator=generator)

@@ -1,0 +1,68 @@
+"""How long training has taken, a killed run's part included; goes to run.json, never to what is published."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+NAME = "clock.json"
+
+Mark = tuple[int, float, float]
+"""Iterations done, and the wall-clock and processor seconds that they took."""
+
+
+class Clock:
+    """Seconds of the iterations alone: what is only looked at on the way does not count.
+
+    Attributes:
+        marks: of the points of the curve.
+        earlier: of the processes that were killed before this one, up to their last checkpoint.
+    """
+
+    def __init__(self, work: Path, iteration: int):
+        """Starts; goes on from the marks of a killed run if training goes on from its checkpoint.
+
+        Args:
+            work: the folder with the checkpoint.
+            iteration: steps done at the start.
+        """
+        self._file = work / NAME
+        self.marks: list[Mark] = []
+        self.earlier: Mark = (0, 0.0, 0.0)
+        if iteration:
+            self._read(iteration)
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def _read(self, iteration: int) -> None:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            known = json.loads(self._file.read_text(encoding="utf-8"))
+            if known["earlier"][0] == iteration:
+                self.earlier = tuple(known["earlier"])
+                self.marks = [tuple(mark) for mark in known["marks"] if mark[0] <= iteration]
+
+    def now(self, iteration: int) -> Mark:
+        """The mark of this moment."""
+        wall, cpu = time.monotonic() - self._wall, time.process_time() - self._cpu
+        return iteration, round(self.earlier[1] + wall, 3), round(self.earlier[2] + cpu, 3)
+
+    def mark(self, iteration: int) -> None:
+        """Notes a point of the curve."""
+        self.marks.append(self.now(iteration))
+
+    def save(self, iteration: int) -> None:
+        """To be called when a checkpoint has been written."""
+        state = {"earlier": self.now(iteration), "marks": self.marks}
+        self._file.write_text(json.dumps(state), encoding="utf-8")
+
+    @contextlib.contextmanager
+    def aside(self) -> Iterator[None]:
+        """What happens inside is not training."""
+        wall, cpu = time.monotonic(), time.process_time()
+        try:
+            yield
+        finally:
+            self._wall += time.monotonic() - wall
+            self._cpu += time.process_time() - cpu
