@@ -46,7 +46,9 @@ def require_finite(tensors: Mapping[str, Tensor], who: str, where: str, remedy: 
         return
     for name, tensor in tensors.items():
         if not bool(tensor.isfinite().all()):
-            raise NotFiniteError(f"{who} stopped: {name} is not finite {where} ({described(tensor)}); {remedy}")
+            raise NotFiniteError(
+                f"{who} stopped: {name} is not finite {where} ({described(tensor)}); {remedy}"
+            )
 
 
 def finite(tensors: Iterable[Tensor]) -> bool:
@@ -62,7 +64,7 @@ def finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def described(tensor: Tensor) -> str:
-    """How many numbers of a tensor are not finite, and the first: "2 of 30 numbers, the first nan at [1, 0]"."""
+    """How many numbers of a tensor are not finite, and which is the first of them."""
     bad = ~tensor.detach().isfinite()
     place = bad.nonzero()[0].tolist()
     value = float(tensor[tuple(place)])

@@ -34,7 +34,7 @@ def write_table(path: Path, schema: pa.Schema, columns: dict[str, np.ndarray]) -
 
     Raises:
         ValueError: a column is missing or has another length.
-        NotFiniteError: a column holds a number that is not finite; names the row, and its frame if it has one.
+        NotFiniteError: a number is not finite; names its column, row and, if it has one, frame.
     """
     if set(columns) != set(schema.names):
         raise ValueError(f"{path.name}: columns {sorted(columns)} are not {sorted(schema.names)}")

@@ -4,9 +4,9 @@ Either lasts a frame or a few, and costs more than those: the start turns the bo
 are wide in time carry the neighbours along (one exchanged frame of 24 turned a dozen others by 30 to 140
 degrees; one frame of nonsense of 16 all others by 20). What lies around such frames says where the body is.
 
-**Exchanged.** A body cannot turn round between two frames of a film. So where exchanging left and right brings
-a frame's points much nearer to those of the frame before, one of the two is exchanged; of the stretches
-between such places every other one is, and it is the shorter ones that are not believed.
+**Exchanged.** A body cannot turn round between two frames of a film. So where exchanging left and right
+brings a frame's points much nearer to those of the frame before, one of the two is exchanged; of the
+stretches between such places every other one is, and it is the shorter ones that are not believed.
 
 **Nonsense.** Nor can it move by much of its own length and back again within a frame or two.
 """
@@ -26,7 +26,8 @@ _FACE_OF_POSE = 11  # MediaPipe's first points are the head's
 _SCORE = 0.4  # of a point, or of both points of a pair
 _LEAST = 2  # pairs that must be seen
 _SOON = 3  # frames of the footage within which nobody turns round, or moves and is back
-_NEARER, _APART = 0.3, 0.12  # exchanged distance, of the others'; least distance of left and right, of the extent
+_NEARER = 0.3  # the exchanged points' distance, of the others'
+_APART = 0.12  # least distance of left and right, of the body's extent; less is a side view
 _LONGEST = 5  # frames of an exchanged stretch that is not believed
 _FAR, _NEAR = 0.4, 0.15  # mean distance of nonsense from its neighbours, and of these, of the extent
 

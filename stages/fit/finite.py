@@ -13,7 +13,7 @@ from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.windows import Window
 
-REMEDY = "look at these frames' keypoints and cameras, or try a smaller fit.learning_rate; nothing is published"
+REMEDY = "look at the keypoints and cameras, or try a smaller fit.learning_rate; nothing is published"
 _NAMED = 5  # frames that a message names
 
 
@@ -31,7 +31,8 @@ def finite_sum(losses: Mapping[str, Tensor], step: int, frames: str = "") -> Ten
     total = torch.stack(list(losses.values())).sum()
     if not math.isfinite(float(total.detach())):
         bad = ", ".join(name for name, loss in losses.items() if not torch.isfinite(loss)) or "their sum"
-        raise NotFiniteError(f"the fit stopped: its loss is not finite at step {step}: {bad}{frames}; {REMEDY}")
+        what = f"its loss is not finite at step {step}: {bad}{frames}"
+        raise NotFiniteError(f"the fit stopped: {what}; {REMEDY}")
     return total
 
 
@@ -70,7 +71,7 @@ def require_finite_gradient(objective: Objective, gradient: Mapping[str, Tensor]
 
 @torch.no_grad()
 def frames_at_fault(objective: Objective, parameters: Parameters, window: Window) -> list[int]:
-    """The rows of the clip whose parameters or projected points are not finite, of a window's posed frames."""
+    """The rows of the clip, of a window's posed frames, whose parameters or pixels are not finite."""
     pixels = objective.predict(parameters, window).pixels
     tensors = [getattr(parameters, name) for name in PER_FRAME] + [pixels]
     return sorted({window.low + row for tensor in tensors for row in rows_not_finite(tensor)})

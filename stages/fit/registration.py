@@ -17,8 +17,8 @@ from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from pipeline.threads import threads
-from stages.fit.face import fit_face
 from stages.fit.doubt import without_doubted
+from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.objective import Face, Objective
@@ -119,8 +119,8 @@ def believed(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
     keypoints, doubted = without_doubted(keypoints)
     if doubted:
         log(
-            f"frame {', '.join(map(str, doubted))}: left and right are exchanged, or the points are nowhere near "
-            "those of the frames around; body and hands are not believed there"
+            f"frame {', '.join(map(str, doubted))}: left and right are exchanged, or the points are nowhere "
+            "near those of the frames around; body and hands are not believed there"
         )
     return keypoints
 

@@ -34,6 +34,7 @@ class Trainer:
         gate: which of the avatar is seen often enough to be trained; None where nothing is gated.
         curve: what has happened so far.
         iteration: optimiser steps done.
+        untrained: mean PSNR of some frames before the first step, dB; None while nobody has looked.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Trainer:
         self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
         self.objective.watch = None if gate is None else gate.watch
         self.curve, self.iteration = Curve(), 0
+        self.untrained: float | None = None
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
         self._parameters = [
             (f"{prefix}.{name}", parameter)
@@ -128,13 +130,14 @@ class Trainer:
         """
         self.require_finite()
         tensors = gather(self._modules(), (self._avatar_optimizer, self._pose_optimizer))
-        return Checkpoint(self.iteration, key, tensors, self.curve.state())
+        return Checkpoint(self.iteration, key, tensors, {**self.curve.state(), "untrained": self.untrained})
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Goes back to where ``checkpoint`` was taken."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
         self.avatar.apply_skin()
         self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
+        self.untrained = checkpoint.extra.get("untrained")
         self._update_phase()
 
     def require_finite(self) -> None:

@@ -25,6 +25,7 @@ from pipeline.threads import threads
 from stages.train.checkpoint import read_checkpoint, run_key, write_checkpoint
 from stages.train.costs import saved
 from stages.train.data import Frames, spread
+from stages.train.divergence import WATCHED, require_progress
 from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
@@ -84,6 +85,7 @@ def run(context: Context) -> None:
 
     Raises:
         UserError: if the inputs do not go together, or training diverges.
+        NotFiniteError: a number of it is not finite; names it, the iteration and the frame.
     """
     with threads(context.settings.threads):
         train_subject(context)
@@ -220,6 +222,9 @@ def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
+    watched = shown or spread(inputs.split.train, WATCHED)
+    if trainer.untrained is None:
+        trainer.untrained = trainer.held_out(inputs.whole, watched)
     started, first = time.monotonic(), trainer.iteration
     with context.progress(settings.iterations, "training") as progress:
         progress.advance(trainer.iteration)
@@ -227,7 +232,10 @@ def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
             values = trainer.step()
             last = trainer.iteration == settings.iterations
             if last or trainer.iteration % settings.held_out_every == 0:
-                held_out = trainer.held_out(inputs.whole, shown) if shown else None
+                trainer.require_finite()
+                now = trainer.held_out(inputs.whole, watched)
+                require_progress(trainer.untrained, now, trainer.iteration, settings)
+                held_out = now if shown else None
                 trainer.curve.point(trainer.iteration, point_values(trainer, held_out))
                 report(trainer.iteration, values, held_out, context)
             if not last and trainer.iteration % settings.checkpoint_every == 0:

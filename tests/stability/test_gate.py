@@ -74,11 +74,16 @@ def test_scores_that_differ_by_rounding_give_one_line():
     """Counts divided by the number of looks: 1/3 is not exactly what 2/6 is in float32."""
     for looks in (3, 7, 500, 4999):
         hits = np.repeat([0, looks // 3, looks], [300, 5, 700])
-        lines = {evidence_threshold(np.float64(np.float32(hits / looks))).tau, evidence_threshold(hits / looks).tau}
+        lines = {
+            evidence_threshold(np.float64(np.float32(hits / looks))).tau,
+            evidence_threshold(hits / looks).tau,
+        }
         assert len(lines) == 1
 
 
-@pytest.mark.parametrize("scores", [np.zeros(0), np.array([0.2, np.nan]), np.array([-0.1, 0.5]), np.array([0.5, 1.1])])
+@pytest.mark.parametrize(
+    "scores", [np.zeros(0), np.array([0.2, np.nan]), np.array([-0.1, 0.5]), np.array([0.5, 1.1])]
+)
 def test_scores_that_are_none_are_refused(scores):
     with pytest.raises(ValueError, match="scores"):
         histogram(scores)
@@ -123,9 +128,13 @@ def test_an_avatar_without_any_point_is_refused():
 def test_a_body_outside_every_picture_is_refused(subject, tmp_path):
     from tests.stages.test_train import altered
 
-    context = altered(subject, tmp_path / "away", lambda poses: poses.__class__(
-        poses.frames, poses.rotation, poses.expression, poses.transl + torch.tensor([50.0, 0, 0])
-    ))
+    context = altered(
+        subject,
+        tmp_path / "away",
+        lambda poses: poses.__class__(
+            poses.frames, poses.rotation, poses.expression, poses.transl + torch.tensor([50.0, 0, 0])
+        ),
+    )
     with pytest.raises(UserError, match="outside every frame; run fit again"):
         stage.run(context)
     assert not list(context.output.iterdir())

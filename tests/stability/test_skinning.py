@@ -53,14 +53,20 @@ def random_pose(size, count=3, seed=1):
 
 
 @pytest.mark.parametrize("size", [1.0, 5.0, 50.0, 1e4], ids=str)
-@pytest.mark.parametrize("turn", [0.0, ANATOMICAL, math.pi, 100.0], ids=["rest", "acrobat", "half turns", "turns"])
+@pytest.mark.parametrize(
+    "turn", [0.0, ANATOMICAL, math.pi, 100.0], ids=["rest", "acrobat", "half turns", "turns"]
+)
 def test_extreme_shapes_and_poses_agree_with_double_precision(body, size, turn):
     identity, rotation = identity_of(body, size), random_pose(turn)
     expression = 5 * size * torch.ones(3, body.expression_directions.shape[2])
     single = pose_body(body, identity, rotation, expression, torch.zeros(3, 3))[0]
     precise = body.to(torch.float64)
-    exact_identity = Identity(*(getattr(identity, name).double() for name in ("betas", "joint_offset", "face_offset")))
-    exact = pose_body(precise, exact_identity, rotation.double(), expression.double(), torch.zeros(3, 3).double())[0]
+    exact_identity = Identity(
+        *(getattr(identity, name).double() for name in ("betas", "joint_offset", "face_offset"))
+    )
+    exact = pose_body(
+        precise, exact_identity, rotation.double(), expression.double(), torch.zeros(3, 3).double()
+    )[0]
     assert single.isfinite().all()
     extent = float(exact.abs().max())
     # A chain of twelve joints: some ten roundings, and 2e-7 of the angle.
@@ -74,7 +80,9 @@ def test_slopes_of_an_extreme_pose_are_finite_and_those_of_double_precision(body
         cast = body.to(dtype)
         pose = rotation.to(dtype, copy=True).requires_grad_()
         identity = mean_identity(cast)
-        vertices, _ = pose_body(cast, identity, pose, torch.zeros(1, 1, dtype=dtype), torch.zeros(1, 3, dtype=dtype))
+        vertices, _ = pose_body(
+            cast, identity, pose, torch.zeros(1, 1, dtype=dtype), torch.zeros(1, 3, dtype=dtype)
+        )
         vertices.square().mean().backward()
         slopes.append(pose.grad.double())
     assert slopes[0].isfinite().all()
@@ -148,7 +156,9 @@ def test_the_laplacian_of_a_collapsed_or_lonely_vertex_is_finite():
 def test_a_body_without_extent_is_posed_and_drawn(body):
     """All vertices in one point: no normal, no spacing, no triplane box."""
     flat = type(body)(**{**vars(body), "v_template": torch.zeros_like(body.v_template)})
-    bare = Architecture(plane_resolution=4, plane_channels=2, subdivisions=0, width=16, groups=4, residual_width=16)
+    bare = Architecture(
+        plane_resolution=4, plane_channels=2, subdivisions=0, width=16, groups=4, residual_width=16
+    )
     avatar = Avatar(flat, mean_identity(flat), torch.arange(len(flat.v_template)), bare).eval()
     gaussians = avatar.gaussians(torch.zeros(55, 3), torch.zeros(1), torch.tensor([0.0, 0, -2.0]))
     image = render(gaussians, facing_camera(32, 32, 40.0)).color
@@ -157,7 +167,9 @@ def test_a_body_without_extent_is_posed_and_drawn(body):
 
 # The avatar
 
-SMALL = Architecture(plane_resolution=8, plane_channels=4, subdivisions=1, width=16, groups=4, residual_width=16)
+SMALL = Architecture(
+    plane_resolution=8, plane_channels=4, subdivisions=1, width=16, groups=4, residual_width=16
+)
 
 
 @pytest.mark.parametrize("kept", [[0], [0, 5000], [10, 11, 12]], ids=["one", "two far apart", "three"])
@@ -208,7 +220,9 @@ def test_scales_and_colours_of_extreme_heads_stay_in_their_ranges(body, value):
 def test_the_kernels_of_posing_agree_with_torch_in_extreme_poses(body, turn):
     avatar = Avatar(body, mean_identity(body), torch.arange(0, 13000, 7), SMALL)
     surface = avatar.surfaces[0]
-    transforms = joint_transforms(random_pose(turn, 1), surface.canonical.joints, surface.canonical.parents)[0]
+    transforms = joint_transforms(random_pose(turn, 1), surface.canonical.joints, surface.canonical.parents)[
+        0
+    ]
     points, transl = surface.canonical.vertices, torch.tensor([0.0, 0.0, -2.0])
     means, quaternions = surface.rig.place(transforms, points, transl)
     expected_means, expected = plain_place(surface.rig, transforms, points, transl)

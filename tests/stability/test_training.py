@@ -1,6 +1,5 @@
 """Training when things go wrong: spikes, bad frames, rates that are far too high, long runs."""
 
-import dataclasses
 import os
 import shutil
 
@@ -11,12 +10,12 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
 from pipeline.errors import UserError
-from pipeline.frames import frame_path, read_frame, write_frame, write_mask
+from pipeline.frames import frame_path, write_frame, write_mask
 from pipeline.guard import NotFiniteError
 from stages.train import losses, schedule
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, read_checkpoint
-from stages.train.loop import Trainer
+from stages.train.divergence import require_progress
 from tests.stages.test_train import trainer_for
 from tests.stages.train_subject import BODY_FILE, HEIGHT, TINY, WIDTH, context_for, write_subject
 
@@ -67,10 +66,11 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
     place = spoilt(subject, tmp_path / "noise")
     noise = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     write_frame(place / "ingest" / "frames", 2, noise)
-    trainer = trainer_for(context_for(place, tmp_path / "out", iterations=20))
-    clean = trainer_for(context_for(subject, tmp_path / "clean", iterations=20))
-    steps(trainer, 20)
-    steps(clean, 20)
+    settings = {"iterations": 12, "face": 0.0}
+    trainer = trainer_for(context_for(place, tmp_path / "out", **settings))
+    clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
+    steps(trainer, 12)
+    steps(clean, 12)
     inputs = stage.read_inputs(context_for(subject, tmp_path / "unused"))
     scores = [one.held_out(inputs.whole, inputs.split.test) for one in (trainer, clean)]
     assert scores[0] > scores[1] - 6
@@ -80,7 +80,7 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
 def test_a_frame_with_an_empty_or_a_full_mask_is_trained_through(subject, tmp_path, value):
     place = spoilt(subject, tmp_path / "mask")
     write_mask(place / "ingest" / "masks", 1, np.full(SIZE, value, np.uint8))
-    context = context_for(place, tmp_path / "out")
+    context = context_for(place, tmp_path / "out", iterations=6, face=0.0)
     stage.run(context)
     load_avatar(context.output / "avatar.safetensors", load_body(BODY_FILE))
 
@@ -90,8 +90,8 @@ def test_black_and_white_frames_are_trained_through(subject, tmp_path, value):
     place = spoilt(subject, tmp_path / "flat")
     for frame in range(5):
         write_frame(place / "ingest" / "frames", frame, np.full((*SIZE, 3), value, np.uint8))
-    trainer = trainer_for(context_for(place, tmp_path / "out"))
-    steps(trainer, 12)
+    trainer = trainer_for(context_for(place, tmp_path / "out", face=0.0))
+    steps(trainer, 6)
 
 
 def test_masks_of_nobody_at_all_are_refused(subject, tmp_path):
@@ -131,10 +131,11 @@ def test_a_loss_spike_does_not_move_the_weights_further_than_a_step(subject, tmp
     """Adam divides by the spike what the spike multiplied: a million times the loss, one step's length."""
     trainer = trainer_for(context_for(subject, tmp_path / "out", iterations=20))
     steps(trainer, 6)
-    original, before = losses.l1, torch.nn.utils.parameters_to_vector(trainer.avatar.parameters()).detach().clone()
+    original, weights = losses.l1, trainer.avatar.parameters
+    before = torch.nn.utils.parameters_to_vector(weights()).detach().clone()
     monkeypatch.setattr(losses, "l1", lambda image, target: 1e6 * original(image, target))
     trainer.step()
-    moved = (torch.nn.utils.parameters_to_vector(trainer.avatar.parameters()) - before).abs().max()
+    moved = (torch.nn.utils.parameters_to_vector(weights()) - before).abs().max()
     assert moved < 12 * TINY.plane_learning_rate
     monkeypatch.undo()
     after = steps(trainer, 8)
@@ -161,7 +162,7 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
 
     monkeypatch.setattr(losses, "l1", rooted)
     frame = schedule.drawn_frame(TINY.seed, (0, 1, 2, 3, 4), 5)
-    with pytest.raises(NotFiniteError, match=f"the gradient of avatar.* is not finite at iteration 5, frame {frame} "):
+    with pytest.raises(NotFiniteError, match=f"the gradient of .* not finite at iteration 5, frame {frame} "):
         stage.run(context)
     assert not list(context.output.iterdir())
     saved = checkpoint_of(context)
@@ -176,27 +177,31 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
 def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
     trainer = trainer_for(context_for(subject, tmp_path / "out", batch=2))
     monkeypatch.setattr(losses, "ssim", lambda image, target: losses.l1(image, target) * float("nan"))
-    with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d; try a smaller"):
+    with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d;"):
         trainer.step()
 
 
 # Rates
 
 
-@pytest.mark.parametrize("factor", [100, 1e4, 1e8, 1e30])
-def test_rates_far_too_high_end_with_an_error_and_the_last_good_checkpoint_or_a_finite_avatar(
-    subject, tmp_path, factor
-):
-    rates = {
-        name: factor * getattr(TINY, name)
-        for name in ("learning_rate", "plane_learning_rate", "pose_learning_rate")
-    }
-    context = context_for(subject, tmp_path / "out", iterations=30, checkpoint_every=1, warm_up=1, **rates)
-    with pytest.raises(UserError, match=r"training .*train\.learning_rate"):
+@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak), 1e30])
+def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(subject, tmp_path, factor):
+    """Finite ruins (100, 1e4) and overflow (1e30); before, the ruins were published."""
+    names = ("learning_rate", "plane_learning_rate", "pose_learning_rate")
+    rates = {name: factor * getattr(TINY, name) for name in names}
+    settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "warm_up": 1, "face": 0.0}
+    context = context_for(subject, tmp_path / "out", **settings, **rates)
+    with pytest.raises(UserError, match=r"training stopped: .*learning_rate.* checkpoint is kept, nothing"):
         stage.run(context)
     assert not list(context.output.iterdir())
     saved = checkpoint_of(context)
-    assert all_finite(saved.tensors.values())
+    assert saved.iteration in (1, 3) and all_finite(saved.tensors.values())
+
+
+def test_a_worse_avatar_is_refused_and_a_better_one_is_not():
+    require_progress(20.0, 17.1, 250, TINY)
+    with pytest.raises(UserError, match=r"after 250 iterations its pictures are worse .* 16\.9 dB of 20\.0"):
+        require_progress(20.0, 16.9, 250, TINY)
 
 
 # Long
@@ -210,14 +215,9 @@ def drift(subject, tmp_path, count, **settings):
     return np.array(taken), trainer.held_out(inputs.whole, inputs.split.test)
 
 
-def in_double(trainer):
-    """The same run in float64: weights, surfaces, poses and frames."""
-    raise NotImplementedError
-
-
 def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
     half, single = (
-        drift(subject, tmp_path / name, 25, half_precision=name == "half") for name in ("half", "single")
+        drift(subject, tmp_path / name, 12, half_precision=name == "half") for name in ("half", "single")
     )
     assert np.abs(half[0] - single[0]).max() < 0.05 * single[0][0]
     assert abs(half[1] - single[1]) < 0.5
@@ -237,9 +237,10 @@ def test_thousands_of_steps_on_one_frame(subject, tmp_path):
     assert taken[-1] < 0.5 * taken[0]
 
 
-def test_hundreds_of_steps_of_a_settled_run_stay_settled(subject, tmp_path):
+def test_a_settled_run_stays_settled(subject, tmp_path):
     """Nothing is left to learn: Adam's second moments fade, and its steps must not blow up."""
-    trainer = trainer_for(context_for(subject, tmp_path / "out", iterations=60, final_rate=1.0, warm_up=1))
-    taken = steps(trainer, 60)
-    assert max(taken[30:]) < 1.5 * max(taken[:10])
-    assert dataclasses.is_dataclass(trainer.settings) and isinstance(trainer, Trainer)
+    trainer = trainer_for(
+        context_for(subject, tmp_path / "out", iterations=40, final_rate=1.0, warm_up=1, face=0.0)
+    )
+    taken = steps(trainer, 40)
+    assert max(taken[20:]) < 1.5 * max(taken[:10])
