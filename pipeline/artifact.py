@@ -23,6 +23,7 @@ import filelock
 from pipeline import digest, seal
 from pipeline.errors import UserError
 from pipeline.explain import is_disk_full
+from pipeline.guard import require_finite_files
 
 MANIFEST = "manifest.json"
 RUN = "run.json"
@@ -183,6 +184,7 @@ class Store:
             description: what the manifest says besides the files: stage, version, settings, inputs.
             run: what differs between two equal runs (seconds, host, memory), for ``run.json``.
         """
+        require_finite_files(scratch.output, "run the stage again, and report it if it happens again")
         files = [
             describe_file(scratch.output, path)
             for path in sorted(scratch.output.rglob("*"))

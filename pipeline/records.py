@@ -21,6 +21,7 @@ import torch
 
 from pipeline.camera import Camera
 from pipeline.errors import UserError
+from pipeline.guard import NotFiniteError, not_finite_in
 from pipeline.tables import read_table, vectors, write_table
 from pipeline.untrusted import parse_json
 
@@ -159,7 +160,14 @@ def read_footage(path: Path) -> Footage:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON with sorted keys; ValueError for numbers that are not finite."""
+    """Write JSON with sorted keys.
+
+    Raises:
+        NotFiniteError: a number is not finite; names its place.
+    """
+    place = not_finite_in(value)
+    if place is not None:
+        raise NotFiniteError(f"{path.name}: {place} is not finite")
     path.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import UserError
+from pipeline.guard import NotFiniteError
 
 MOST_BYTES = 4 << 30  # an hour of keypoints unpacks to half of it
 
@@ -32,10 +33,12 @@ def write_table(path: Path, schema: pa.Schema, columns: dict[str, np.ndarray]) -
         columns: one array for each name in the schema, all of the same first dimension.
 
     Raises:
-        ValueError: a column is missing, has another length, or holds a number that is not finite.
+        ValueError: a column is missing or has another length.
+        NotFiniteError: a number is not finite; names its column, row and, if it has one, frame.
     """
     if set(columns) != set(schema.names):
         raise ValueError(f"{path.name}: columns {sorted(columns)} are not {sorted(schema.names)}")
+    _require_finite(path.name, columns)
     arrays = [_to_arrow(path.name, field, np.asarray(columns[field.name])) for field in schema]
     if len({len(array) for array in arrays}) > 1:
         raise ValueError(f"{path.name}: its columns have different lengths")
@@ -80,9 +83,19 @@ def open_table(path: Path) -> pa.Table:
         return file.read()
 
 
+def _require_finite(name: str, columns: dict[str, np.ndarray]) -> None:
+    for column, values in columns.items():
+        array = np.asarray(values)
+        if array.dtype.kind != "f" or np.isfinite(array).all():
+            continue
+        row = int(np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))[0])
+        frame = f", frame {columns['frame'][row]}" if "frame" in columns else ""
+        raise NotFiniteError(
+            f"{name}: column {column!r} holds numbers that are not finite, the first in row {row}{frame}"
+        )
+
+
 def _to_arrow(name: str, field: pa.Field, array: np.ndarray) -> pa.Array:
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name}: column {field.name!r} holds numbers that are not finite")
     if not pa.types.is_fixed_size_list(field.type):
         return pa.array(array, type=field.type)
     flat = pa.array(np.ascontiguousarray(array).reshape(-1), type=field.type.value_type)

@@ -96,7 +96,13 @@ def body_in_frame(surface: Surface, rotation: Tensor, transl: Tensor, camera: Ca
 
 
 def histogram(scores: np.ndarray) -> np.ndarray:
-    """How many scores, [V] in [0, 1], lie in each of ``BINS`` equal bins: [256] int64."""
+    """How many scores, [V] in [0, 1], lie in each of ``BINS`` equal bins: [256] int64.
+
+    Raises:
+        ValueError: there is no score, or one is no share.
+    """
+    if not len(scores) or not (scores.min() >= 0 and scores.max() <= 1):
+        raise ValueError("scores must be numbers from 0 to 1, and at least one")
     return np.bincount(np.minimum((scores * BINS).astype(np.int64), BINS - 1), minlength=BINS)
 
 

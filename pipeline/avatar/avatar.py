@@ -183,7 +183,12 @@ class Avatar(nn.Module):
 
         Args:
             active: [K] bool, with at least one.
+
+        Raises:
+            ValueError: none is left.
         """
+        if not bool(active.any()):
+            raise ValueError("an avatar needs at least one active vertex")
         self.active.copy_(active)
         self._baked = None
 

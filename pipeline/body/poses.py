@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
 from pipeline.errors import UserError
+from pipeline.guard import NotFiniteError, rows_not_finite
 from pipeline.tables import open_table
 
 _JOINTS = len(JOINT_NAMES)
@@ -67,7 +68,14 @@ def write_poses(path: Path, poses: Poses) -> None:
 
     Columns: ``frame`` int32; ``rotation`` [165], ``expression`` [E] and ``transl`` [3], lists of float32
     of one size each; ``valid`` bool, whether the pose was measured rather than interpolated.
+
+    Raises:
+        NotFiniteError: a number is not finite; names the frame.
     """
+    for name in ("rotation", "expression", "transl"):
+        bad = rows_not_finite(getattr(poses, name))
+        if bad:
+            raise NotFiniteError(f"{path.name}: {name} of frame {poses.frames[bad[0]]} is not finite")
     columns = {
         "frame": pa.array(poses.frames, pa.int32()),
         "rotation": _column(poses.rotation.flatten(1)),

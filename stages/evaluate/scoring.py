@@ -12,6 +12,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from pipeline.guard import require_finite
 from pipeline.metrics.image import psnr, ssim
 from pipeline.metrics.intervals import Interval, interval
 from pipeline.metrics.lpips import Lpips
@@ -110,6 +111,7 @@ class Scorer:
             image: [H, W, 3] float in [0, 1], on the background.
             black: the same on black; the image itself if None.
         """
+        require_finite({"a picture": image}, "scoring", "before any metric", "run the train stage again")
         features = {name: network.features(image) for name, network in self.networks.items()}
         return Picture(image, image if black is None else black, features)
 

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from pipeline.threads import threads
+from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.windows import Window, bumps, windows
@@ -101,7 +101,7 @@ def gradients(
         leaf.grad = torch.zeros_like(leaf)
     for window in windows(len(times), size):
         parameters, leaves = stepped(base, steps, times, width, window)
-        loss = finite_sum(objective(parameters, robust, window), step)
+        loss = finite_loss(objective, parameters, robust, window, step)
         loss.backward()
         total += float(loss.detach())
         _, first, last = bumps(times, width, window.low, window.high)
@@ -109,6 +109,7 @@ def gradients(
             if leaf.grad is not None:
                 whole = getattr(steps, name).grad
                 (whole[first:last] if name in PER_FRAME else whole).add_(leaf.grad)
+    require_finite_gradient(objective, {name: leaf.grad for name, leaf in steps.named().items()}, step)
     return total
 
 
@@ -133,7 +134,7 @@ def optimise(
         watch: called after each step.
 
     Raises:
-        FloatingPointError: the loss is not finite.
+        NotFiniteError: the loss or its gradient is not finite.
     """
     base = initial.detached()
     # Adam keeps its memory from phase to phase: begun anew, its first steps have the full length in every
@@ -167,19 +168,6 @@ def _moved(base: Parameters, steps: Parameters, times: Tensor, width: float, siz
         parts.append(parameters.rows(window.own.start, window.own.stop))
     joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in PER_FRAME}
     return dataclasses.replace(parts[0], **joined).orthonormal()
-
-
-def finite_sum(losses: Mapping[str, Tensor], step: int) -> Tensor:
-    """The sum of the terms.
-
-    Raises:
-        FloatingPointError: it is not finite; the message names the terms.
-    """
-    total = torch.stack(list(losses.values())).sum()
-    if not math.isfinite(float(total.detach())):
-        bad = [name for name, loss in losses.items() if not torch.isfinite(loss)]
-        raise FloatingPointError(f"the fit's loss is not finite at step {step}: {', '.join(bad)}")
-    return total
 
 
 def _phases(iterations: int) -> list[tuple[int, int, float]]:

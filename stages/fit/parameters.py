@@ -23,6 +23,7 @@ from pipeline.body.landmarks import PointSet
 EYES, HANDS = slice(23, 25), slice(25, 55)
 ROTATIONS = ("global_orient", "body_pose", "jaw", "eyes", "hands")
 PER_FRAME = (*ROTATIONS, "expression", "transl")
+_ORTHOGONAL = 1e-3  # by how much the third column's squared length may differ from 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Parameters:
     def matrices(self) -> Tensor:
         """Theta, [T, 55, 3, 3], rotation matrices relative to the parent, in the order of the schema."""
         six = torch.cat([getattr(self, name) for name in ROTATIONS], dim=1)
-        return roma.special_gramschmidt(six.unflatten(-1, (3, 2)))
+        return orthonormalised(six.unflatten(-1, (3, 2)))
 
     def orthonormal(self) -> Parameters:
         """The same rotations with unit and orthogonal columns."""
@@ -90,6 +91,32 @@ class Parameters:
     def detached(self) -> Parameters:
         """Copies of the values alone."""
         return Parameters(**{name: value.detach().clone() for name, value in self.named().items()})
+
+
+def orthonormalised(columns: Tensor) -> Tensor:
+    """The rotations whose first two columns are nearest to given ones, one after the other.
+
+    Columns that are parallel, or zero, say no rotation: the second is then any that stands upright on the
+    first, and neither has a gradient.
+
+    Args:
+        columns: [..., 3, 2].
+
+    Returns:
+        [..., 3, 3].
+    """
+    matrices = roma.special_gramschmidt(columns)
+    upright = (matrices[..., 2].detach().square().sum(-1, keepdim=True) - 1).abs() < _ORTHOGONAL
+    if bool(upright.all()):
+        return matrices
+    with torch.no_grad():
+        first = columns[..., 0]
+        length = first.norm(dim=-1, keepdim=True)
+        first = torch.where(length > 0, first / length, first.new_tensor([1.0, 0.0, 0.0]))
+        second = one_hot(first.abs().argmin(-1), 3).to(first)  # of the axes the one least along the first
+    # Gradients of what is not used are asked for too, so Gram and Schmidt must not see it.
+    safe = torch.where(upright[..., None], columns, torch.stack([first, second], dim=-1))
+    return roma.special_gramschmidt(safe)
 
 
 def parameters_of(rotation: Tensor, transl: Tensor, sizes: tuple[int, int, int]) -> Parameters:

@@ -17,6 +17,7 @@ from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from pipeline.threads import threads
+from stages.fit.doubt import without_doubted
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
@@ -81,6 +82,7 @@ def register(
         UserError: a frame has no camera, or there are no frames.
     """
     views = views_of(keypoints, cameras)
+    keypoints = believed(keypoints, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
     observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
@@ -110,6 +112,17 @@ def register(
     error = objective.residuals(fitted)
     seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
     return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
+
+
+def believed(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+    """The detections without those of frames that are not believed, see ``doubt.py``."""
+    keypoints, doubted = without_doubted(keypoints)
+    if doubted:
+        log(
+            f"frame {', '.join(map(str, doubted))}: left and right are exchanged, or the points are nowhere "
+            "near those of the frames around; body and hands are not believed there"
+        )
+    return keypoints
 
 
 def _minimised(

@@ -135,6 +135,9 @@ class Gate(nn.Module):
         active = captured >= self.line.tau
         if self._settings.unseen == "generated":
             active |= (generated >= self.line.tau) & (self.looked[GENERATED] > 0)
+        if self.line.closed and not bool(active.any()):
+            why = f"a line at {self.line.tau:.2f} would gate all of the body, so none is drawn"
+            self.line = dataclasses.replace(self.line, tau=0.0, why=why)
         faces, rings = self.avatar.surfaces[0].canonical.faces, self._settings.gate_rings
         self.avatar.gate(dilate(active, faces, rings) if self.line.closed else self._first)
         return self.line

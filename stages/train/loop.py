@@ -9,7 +9,7 @@ import torch
 from pipeline.avatar import Avatar
 from pipeline.curves import Curve
 from pipeline.device import moved
-from pipeline.errors import UserError
+from pipeline.guard import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
 from pipeline.metrics.image import psnr
 from pipeline.splat import render
@@ -34,6 +34,7 @@ class Trainer:
         gate: which of the avatar is seen often enough to be trained; None where nothing is gated.
         curve: what has happened so far.
         iteration: optimiser steps done.
+        untrained: mean PSNR of some frames before the first step, dB; None while nobody has looked.
     """
 
     def __init__(
@@ -59,14 +60,20 @@ class Trainer:
         self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
         self.objective.watch = None if gate is None else gate.watch
         self.curve, self.iteration = Curve(), 0
+        self.untrained: float | None = None
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
+        self._parameters = [
+            (f"{prefix}.{name}", parameter)
+            for prefix, module in self._modules().items()
+            for name, parameter in module.named_parameters()
+        ]
         self._update_phase()
 
     def step(self) -> dict[str, float]:
         """One optimiser step; returns the weighted loss terms.
 
         Raises:
-            UserError: if a term is not finite; nothing has been changed then.
+            NotFiniteError: a term or a gradient is not finite; nothing has been changed then.
         """
         self._update_phase()
         terms = self.objective(self.iteration, self.level, self._poses_move())
@@ -75,13 +82,13 @@ class Trainer:
         values = dict(zip(terms, stacked.detach().cpu().tolist(), strict=True))
         for name, value in values.items():
             if not math.isfinite(value):
-                raise UserError(
-                    f"training stopped: loss term '{name}' is {value} at iteration {self.iteration}; "
-                    f"try a smaller train.learning_rate (now {self.settings.learning_rate:g})"
+                raise NotFiniteError(
+                    f"training stopped: loss term '{name}' is {value} {self._where}; {self._remedy}"
                 )
         for optimizer in (self._avatar_optimizer, self._pose_optimizer):
             optimizer.zero_grad(set_to_none=True)
         stacked.sum().backward()
+        self._require_finite_gradients()
         self._avatar_optimizer.step()
         if self._poses_move():
             self._pose_optimizer.step()
@@ -119,32 +126,54 @@ class Trainer:
         """All of the state.
 
         Raises:
-            UserError: if any of it is not finite.
+            NotFiniteError: any of it is not finite.
         """
         self.require_finite()
         tensors = gather(self._modules(), (self._avatar_optimizer, self._pose_optimizer))
-        return Checkpoint(self.iteration, key, tensors, self.curve.state())
+        return Checkpoint(self.iteration, key, tensors, {**self.curve.state(), "untrained": self.untrained})
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Goes back to where ``checkpoint`` was taken."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
         self.avatar.apply_skin()
         self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
+        self.untrained = checkpoint.extra.get("untrained")
         self._update_phase()
 
     def require_finite(self) -> None:
         """Refuses to go on with a parameter that is not finite, however it came to be so.
 
         Raises:
-            UserError: naming the parameter and the iteration.
+            NotFiniteError: naming the parameter and the iteration.
         """
-        for prefix, module in self._modules().items():
-            for name, tensor in module.state_dict().items():
-                if not bool(torch.isfinite(tensor).all()):
-                    raise UserError(
-                        f"training stopped: {prefix}.{name} is not finite after iteration {self.iteration}; "
-                        f"try a smaller train.learning_rate (now {self.settings.learning_rate:g})"
-                    )
+        state = {
+            f"{prefix}.{name}": tensor
+            for prefix, module in self._modules().items()
+            for name, tensor in module.state_dict().items()
+        }
+        require_finite(state, "training", f"after iteration {self.iteration}", self._remedy)
+
+    def _require_finite_gradients(self) -> None:
+        """A loss that is finite may have a slope that is not, and Adam would spread it over all weights."""
+        found = [(name, weight.grad) for name, weight in self._parameters if weight.grad is not None]
+        if not finite(gradient for _, gradient in found):
+            named = {f"the gradient of {name}": gradient for name, gradient in found}
+            require_finite(named, "training", self._where, self._remedy)
+
+    @property
+    def _where(self) -> str:
+        """Where in the run the present step is, for messages."""
+        batch = self.settings.batch
+        frames = [self.objective.draw(self.iteration * batch + place).frame for place in range(batch)]
+        numbers = ", ".join(map(str, frames))
+        return f"at iteration {self.iteration}, frame{'s' if len(frames) > 1 else ''} {numbers}"
+
+    @property
+    def _remedy(self) -> str:
+        return (
+            f"try a smaller train.learning_rate (now {self.settings.learning_rate:g}); the last checkpoint "
+            "is kept, nothing is published"
+        )
 
     def _modules(self) -> dict[str, torch.nn.Module]:
         modules: dict[str, torch.nn.Module] = {

@@ -26,6 +26,7 @@ from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkp
 from stages.train.clock import Clock
 from stages.train.costs import saved
 from stages.train.data import Frames, spread
+from stages.train.divergence import WATCHED, require_progress
 from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.loop import Trainer, describe, point_values
@@ -85,6 +86,7 @@ def run(context: Context) -> None:
 
     Raises:
         UserError: if the inputs do not go together, or training diverges.
+        NotFiniteError: a number of it is not finite; names it, the iteration and the frame.
     """
     with threads(context.settings.threads):
         train_subject(context)
@@ -222,6 +224,10 @@ def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
     clock, first = Clock(context.work, trainer.iteration), trainer.iteration
+    watched = shown or spread(inputs.split.train, WATCHED)
+    if trainer.untrained is None:
+        with clock.aside():
+            trainer.untrained = trainer.held_out(inputs.whole, watched)
     with context.progress(settings.iterations, "training") as progress:
         progress.advance(trainer.iteration)
         while trainer.iteration < settings.iterations:
@@ -229,8 +235,11 @@ def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
             last = trainer.iteration == settings.iterations
             if last or trainer.iteration % settings.held_out_every == 0:
                 clock.mark(trainer.iteration)
+                trainer.require_finite()
                 with clock.aside():
-                    held_out = trainer.held_out(inputs.whole, shown) if shown else None
+                    now = trainer.held_out(inputs.whole, watched)
+                require_progress(trainer.untrained, now, trainer.iteration, settings)
+                held_out = now if shown else None
                 trainer.curve.point(trainer.iteration, point_values(trainer, held_out))
                 report(trainer.iteration, values, held_out, context)
             if not last and trainer.iteration % settings.checkpoint_every == 0:

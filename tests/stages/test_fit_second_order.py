@@ -8,6 +8,7 @@ import roma
 import torch
 
 from pipeline.body import joint_index
+from pipeline.guard import NotFiniteError
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import initial_parameters
 from stages.fit.objective import Objective
@@ -390,5 +391,5 @@ def test_body_seen_from_behind_turns_through_pi(model, clip):
 
 def test_loss_that_is_not_finite_is_said(model, clip):
     objective, initial, frozen = problem_of(model, clip)
-    with pytest.raises(FloatingPointError, match="not finite"):
+    with pytest.raises(NotFiniteError, match="not finite"):
         solve(objective, dataclasses.replace(initial, transl=initial.transl * math.nan), frozen)

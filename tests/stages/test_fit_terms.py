@@ -9,11 +9,13 @@ import roma
 import torch
 
 from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
+from pipeline.guard import NotFiniteError
 from stages.fit import terms
 from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix
+from stages.fit.finite import finite_sum
 from stages.fit.initialise import continuous, torso_orientation
 from stages.fit.observations import drop_guesses, observe, visible
-from stages.fit.optimise import finite_sum, rate
+from stages.fit.optimise import rate
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.ranges import joint_ranges
 from stages.fit.registration import views_of
@@ -285,7 +287,7 @@ def test_rate_is_coarse_to_fine():
 
 
 def test_loss_that_is_not_finite_is_named():
-    with pytest.raises(FloatingPointError, match="step 7: smooth"):
+    with pytest.raises(NotFiniteError, match="step 7: smooth"):
         finite_sum({"keypoints": torch.ones(()), "smooth": torch.tensor(math.nan)}, 7)
 
 

@@ -73,7 +73,7 @@ def solve(
         watch: called after each step, with parameters of all frames.
 
     Raises:
-        FloatingPointError: the loss is not finite.
+        NotFiniteError: the loss or its gradient is not finite.
     """
     taken = 0
     with threads(1):

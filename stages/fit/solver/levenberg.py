@@ -9,11 +9,11 @@ takes less of it and is damped more in the next.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import torch
 from torch import Tensor
 
+from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.solver.banded import factorise
@@ -76,6 +76,7 @@ class Levenberg:
     Attributes:
         objective: the prepared one.
         damping: lambda, [T], relative to the diagonal of the second derivatives.
+        taken: how many steps were begun.
     """
 
     def __init__(self, objective: Objective, minibatch: int) -> None:
@@ -85,6 +86,7 @@ class Levenberg:
         self._groups: list[Group] = groups_of(objective)
         self._coupling: Coupling = coupling_of(objective.times)
         self.damping = torch.full((self._count,), _DAMPING)
+        self.taken = 0
 
     def step(
         self, parameters: Parameters, objective: Objective, robust: bool, unknowns: Unknowns
@@ -101,12 +103,11 @@ class Levenberg:
             The parameters after it, the loss there, and whether any step was an improvement.
 
         Raises:
-            FloatingPointError: the loss is not finite to begin with.
+            NotFiniteError: the loss or its gradient is not finite to begin with.
         """
+        self.taken += 1
         gradient = self._gradient(parameters, objective, robust)
         loss, of_frames = self._losses(parameters, objective, robust)
-        if not math.isfinite(loss):
-            raise FloatingPointError("the fit's loss is not finite")
         for _ in range(_ATTEMPTS):
             step = self._solve(parameters, objective, robust, unknowns, gradient)
             if step is not None:
@@ -131,11 +132,12 @@ class Levenberg:
         total = parameters.zeros()
         for window in windows(self._count, self._minibatch):
             leaves = parameters.rows(window.low, window.high).leaves()
-            torch.stack(list(objective(leaves, robust, window).values())).sum().backward()
+            finite_loss(objective, leaves, robust, window, self.taken).backward()
             for name, leaf in leaves.named().items():
                 if leaf.grad is not None:
                     whole = getattr(total, name)
                     (whole[window.posed] if name in PER_FRAME else whole).add_(leaf.grad, alpha=self._count)
+        require_finite_gradient(objective, total.named(), self.taken)
         return gradient_step(parameters, total)
 
     @torch.no_grad()

@@ -1,0 +1,182 @@
+"""Otsu's line and the visibility gate: every shape of histogram, everything gated, flicker at the line."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar import Avatar
+from pipeline.body import load_body, mean_identity
+from pipeline.errors import UserError
+from pipeline.records import read_json
+from pipeline.visibility import (
+    BINS,
+    LARGEST_LOSS,
+    LEAST_CUT,
+    authors_threshold,
+    cost,
+    evidence_threshold,
+    fixed_threshold,
+    histogram,
+    otsu,
+)
+from stages.train import run as stage
+from stages.train.gate import Gate
+from tests.stability.test_skinning import SMALL
+from tests.stages.test_train import trainer_for
+from tests.stages.train_subject import BODY_FILE, TINY, context_for, write_subject
+
+RNG = np.random.default_rng(0)
+SHAPES = {
+    "all 0": np.zeros(100),
+    "all 1": np.ones(100),
+    "all in one bin": np.full(100, 0.5) + RNG.uniform(0, 1e-4, 100),
+    "one score": np.array([0.3]),
+    "two equal scores": np.array([0.3, 0.3]),
+    "two neighbouring bins": np.repeat([100 / BINS, 101 / BINS], 50),
+    "0 and 1": np.repeat([0.0, 1.0], 50),
+    "one outlier low": np.r_[0.0, np.ones(9999)],
+    "one outlier high": np.r_[np.zeros(9999), 1.0],
+    "three spikes": np.repeat([0.0, 0.5, 1.0], [30, 30, 40]),
+    "a spike every bin": (np.arange(BINS) + 0.5) / BINS,
+    "on the bins' edges": np.arange(BINS + 1) / BINS,
+    "uniform": RNG.random(5000),
+    "bell": np.clip(RNG.normal(0.5, 0.1, 5000), 0, 1),
+    "two bells": np.clip(np.r_[RNG.normal(0.2, 0.05, 2000), RNG.normal(0.9, 0.05, 3000)], 0, 1),
+    "bathtub": RNG.beta(0.2, 0.2, 5000),
+    "exponential": np.clip(RNG.exponential(0.05, 5000), 0, 1),
+    "1 frame in 5,000": np.repeat([0.0, 2e-4, 1.0], [300, 300, 400]),
+    "denormal scores": np.repeat([5e-324, 1.0], [400, 600]),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_histogram_has_a_line_within_its_range(shape):
+    scores = SHAPES[shape]
+    tau, separability, low = otsu(histogram(scores))
+    assert 0 <= tau <= 1 and 0 <= separability <= 1 + 1e-9 and 0 <= low <= tau
+    for line in (evidence_threshold(scores), authors_threshold(scores), fixed_threshold(scores, 0.5)):
+        values = (line.tau, line.otsu, line.separability, line.low_mean, line.cut, line.lost)
+        assert np.isfinite(values).all() and line.why
+        assert 0 <= line.cut <= 1 and 0 <= line.lost <= 1
+    line = evidence_threshold(scores)
+    if line.closed:
+        assert line.lost <= LARGEST_LOSS and line.cut >= LEAST_CUT
+        assert (scores >= line.tau).any()  # something is left
+
+
+def test_a_line_never_gates_everything():
+    for scores in SHAPES.values():
+        for line in (evidence_threshold(scores), authors_threshold(scores)):
+            assert (scores >= line.tau).any()
+
+
+def test_scores_that_differ_by_rounding_give_one_line():
+    """Counts divided by the number of looks: 1/3 is not exactly what 2/6 is in float32."""
+    for looks in (3, 7, 500, 4999):
+        hits = np.repeat([0, looks // 3, looks], [300, 5, 700])
+        lines = {
+            evidence_threshold(np.float64(np.float32(hits / looks))).tau,
+            evidence_threshold(hits / looks).tau,
+        }
+        assert len(lines) == 1
+
+
+@pytest.mark.parametrize(
+    "scores", [np.zeros(0), np.array([0.2, np.nan]), np.array([-0.1, 0.5]), np.array([0.5, 1.1])]
+)
+def test_scores_that_are_none_are_refused(scores):
+    with pytest.raises(ValueError, match="scores"):
+        histogram(scores)
+
+
+# In training
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
+    return folder
+
+
+def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_path):
+    """A threshold set by hand that no vertex reaches."""
+    settings = {"gate_threshold": 1.0, "gate_from": 0.25, "gate_every": 2, "iterations": 8}
+    trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
+    before = int(trainer.avatar.active.sum())
+    trainer.gate.looked[:] = 10
+    trainer.gate.hits[:] = 9
+    line = trainer.gate.update()
+    assert not line.closed and "all of the body" in line.why
+    assert int(trainer.avatar.active.sum()) == before
+    values = trainer.step()
+    assert np.isfinite(list(values.values())).all()
+    (tmp_path / "written").mkdir()
+    trainer.gate.write(tmp_path / "written")
+    assert read_json(tmp_path / "written" / "gate.json", "")["tau"] == 0
+
+
+def test_an_avatar_without_any_point_is_refused():
+    body = load_body(BODY_FILE)
+    with pytest.raises(ValueError, match="kept vertices"):
+        Avatar(body, mean_identity(body), torch.zeros(0, dtype=torch.long), SMALL)
+    avatar = Avatar(body, mean_identity(body), torch.arange(50), SMALL)
+    with pytest.raises(ValueError, match="at least one"):
+        avatar.gate(torch.zeros(50, dtype=torch.bool))
+
+
+def test_a_body_outside_every_picture_is_refused(subject, tmp_path):
+    from tests.stages.test_train import altered
+
+    context = altered(
+        subject,
+        tmp_path / "away",
+        lambda poses: poses.__class__(
+            poses.frames, poses.rotation, poses.expression, poses.transl + torch.tensor([50.0, 0, 0])
+        ),
+    )
+    with pytest.raises(UserError, match="outside every frame; run fit again"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def test_flicker_at_the_line_keeps_training_finite_and_weights_in_place(subject, tmp_path):
+    """A hundred vertices cross the line at every look."""
+    settings = {"gate_from": 1.0, "iterations": 20, "subdivisions": 1, "subdivide_from": 0.3}
+    trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
+    on = trainer.avatar.active.clone()
+    off = on.clone()
+    off[torch.nonzero(on)[::7][:100, 0]] = False
+    sizes = set()
+    for step in range(12):
+        trainer.avatar.gate(on if step % 2 else off)
+        values = trainer.step()
+        sizes.add(len(trainer.avatar))
+        assert np.isfinite(list(values.values())).all()
+    assert len(sizes) > 1
+    trainer.require_finite()
+
+
+def test_flickering_gate_gives_the_same_run_twice(subject, tmp_path):
+    settings = {"gate_from": 1.0, "iterations": 6}
+    ends = []
+    for name in ("one", "two"):
+        trainer = trainer_for(context_for(subject, tmp_path / name, **settings))
+        on = trainer.avatar.active.clone()
+        off = on.clone()
+        off[torch.nonzero(on)[::5][:200, 0]] = False
+        for step in range(6):
+            trainer.avatar.gate(on if step % 2 else off)
+            trainer.step()
+        ends.append(torch.nn.utils.parameters_to_vector(trainer.avatar.parameters()))
+    assert torch.equal(*ends)
+
+
+def test_what_was_never_looked_at_has_a_score_of_zero():
+    body = load_body(BODY_FILE)
+    avatar = Avatar(body, mean_identity(body), torch.arange(50), SMALL)
+    gate = Gate(avatar, len(body.v_template), TINY)
+    assert not gate.scores().any() and gate.scores().isfinite().all()
+    line = gate.update()
+    assert not line.closed and bool(avatar.active.all())
+    assert cost(np.zeros(5), 0.5) == (1.0, 0.0)

@@ -1,0 +1,246 @@
+"""Training when things go wrong: spikes, bad frames, rates that are far too high, long runs."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar import load_avatar
+from pipeline.body import load_body
+from pipeline.errors import UserError
+from pipeline.frames import frame_path, write_frame, write_mask
+from pipeline.guard import NotFiniteError
+from stages.train import losses, schedule
+from stages.train import run as stage
+from stages.train.checkpoint import NAME, read_checkpoint
+from stages.train.divergence import require_progress
+from tests.stages.test_train import trainer_for
+from tests.stages.train_subject import BODY_FILE, HEIGHT, TINY, WIDTH, context_for, write_subject
+
+SIZE = (HEIGHT, WIDTH)
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
+    return folder
+
+
+def spoilt(subject, folder):
+    """A copy whose footage may be changed."""
+    shutil.copytree(subject / "ingest", folder / "ingest")
+    for name in ("fit", "plan"):
+        (folder / name).symlink_to(subject / name)
+    return folder
+
+
+def checkpoint_of(context):
+    """The checkpoint that a stopped run left, whatever its key."""
+    import json
+
+    import safetensors
+
+    with safetensors.safe_open(context.work / NAME, "pt") as file:
+        key = json.loads(file.metadata()["checkpoint"])["key"]
+    return read_checkpoint(context.work, key)
+
+
+def all_finite(tensors):
+    return all(bool(tensor.isfinite().all()) for tensor in tensors)
+
+
+def steps(trainer, count):
+    taken = [trainer.step() for _ in range(count)]
+    assert np.isfinite([value for values in taken for value in values.values()]).all()
+    trainer.require_finite()
+    return [sum(values.values()) for values in taken]
+
+
+# Frames
+
+
+def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_path):
+    place = spoilt(subject, tmp_path / "noise")
+    noise = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    write_frame(place / "ingest" / "frames", 2, noise)
+    settings = {"iterations": 12, "face": 0.0}
+    trainer = trainer_for(context_for(place, tmp_path / "out", **settings))
+    clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
+    steps(trainer, 12)
+    steps(clean, 12)
+    inputs = stage.read_inputs(context_for(subject, tmp_path / "unused"))
+    scores = [one.held_out(inputs.whole, inputs.split.test) for one in (trainer, clean)]
+    assert scores[0] > scores[1] - 6
+
+
+@pytest.mark.parametrize("value", [0, 255], ids=["nobody", "everything is the person"])
+def test_a_frame_with_an_empty_or_a_full_mask_is_trained_through(subject, tmp_path, value):
+    place = spoilt(subject, tmp_path / "mask")
+    write_mask(place / "ingest" / "masks", 1, np.full(SIZE, value, np.uint8))
+    context = context_for(place, tmp_path / "out", iterations=6, face=0.0)
+    stage.run(context)
+    load_avatar(context.output / "avatar.safetensors", load_body(BODY_FILE))
+
+
+@pytest.mark.parametrize("value", [0, 255], ids=["black", "white"])
+def test_black_and_white_frames_are_trained_through(subject, tmp_path, value):
+    place = spoilt(subject, tmp_path / "flat")
+    for frame in range(5):
+        write_frame(place / "ingest" / "frames", frame, np.full((*SIZE, 3), value, np.uint8))
+    trainer = trainer_for(context_for(place, tmp_path / "out", face=0.0))
+    steps(trainer, 6)
+
+
+def test_masks_of_nobody_at_all_are_refused(subject, tmp_path):
+    place = spoilt(subject, tmp_path / "nobody")
+    for frame in range(6):
+        write_mask(place / "ingest" / "masks", frame, np.zeros(SIZE, np.uint8))
+    context = context_for(place, tmp_path / "out")
+    with pytest.raises(UserError, match="shows nobody in the training frames; check the footage"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def test_a_damaged_frame_among_good_ones_stops_the_run_by_its_name(subject, tmp_path):
+    place = spoilt(subject, tmp_path / "damaged")
+    path = frame_path(place / "ingest" / "frames", 3)
+    path.write_bytes(path.read_bytes()[:60])
+    context = context_for(place, tmp_path / "out", initial_color=False, face=0.0)
+    with pytest.raises(UserError, match=r"000003\.png is not a readable picture: run the ingest stage"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+
+
+def test_one_frame_and_nothing_held_out(subject, tmp_path):
+    from pipeline.records import Split, write_split
+
+    place = spoilt(subject, tmp_path / "single")
+    write_split(place / "ingest" / "split.json", Split(train=(2,), test=()))
+    context = context_for(place, tmp_path / "out")
+    stage.run(context)
+    assert (context.output / "avatar.safetensors").exists()
+
+
+# Losses
+
+
+def test_a_loss_spike_does_not_move_the_weights_further_than_a_step(subject, tmp_path, monkeypatch):
+    """Adam divides by the spike what the spike multiplied: a million times the loss, one step's length."""
+    trainer = trainer_for(context_for(subject, tmp_path / "out", iterations=20))
+    steps(trainer, 6)
+    original, weights = losses.l1, trainer.avatar.parameters
+    before = torch.nn.utils.parameters_to_vector(weights()).detach().clone()
+    monkeypatch.setattr(losses, "l1", lambda image, target: 1e6 * original(image, target))
+    trainer.step()
+    moved = (torch.nn.utils.parameters_to_vector(weights()) - before).abs().max()
+    assert moved < 12 * TINY.plane_learning_rate
+    monkeypatch.undo()
+    after = steps(trainer, 8)
+    assert after[-1] < 10
+
+
+def test_a_loss_of_the_largest_numbers_stops_by_name(subject, tmp_path, monkeypatch):
+    trainer = trainer_for(context_for(subject, tmp_path / "out"))
+    original = losses.l1
+    monkeypatch.setattr(losses, "l1", lambda image, target: 1e38 * 100 * original(image, target))
+    with pytest.raises(NotFiniteError, match="loss term 'l1' is inf at iteration 0, frame"):
+        trainer.step()
+
+
+def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_path, monkeypatch):
+    """The loss is finite; its slope, the root's at nothing, is not."""
+    context = context_for(subject, tmp_path / "out", checkpoint_every=2, iterations=8)
+    original, calls = losses.l1, []
+
+    def rooted(image, target):
+        calls.append(1)
+        value = original(image, target)
+        return value + (value - value.detach()).square().sqrt() if len(calls) == 6 else value
+
+    monkeypatch.setattr(losses, "l1", rooted)
+    frame = schedule.drawn_frame(TINY.seed, (0, 1, 2, 3, 4), 5)
+    with pytest.raises(NotFiniteError, match=f"the gradient of .* not finite at iteration 5, frame {frame} "):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+    saved = checkpoint_of(context)
+    assert saved.iteration == 4 and all_finite(saved.tensors.values())
+    monkeypatch.undo()
+    said = []
+    context.log = said.append
+    stage.run(context)
+    assert any("goes on from iteration 4" in line for line in said)
+
+
+def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
+    trainer = trainer_for(context_for(subject, tmp_path / "out", batch=2))
+    monkeypatch.setattr(losses, "ssim", lambda image, target: losses.l1(image, target) * float("nan"))
+    with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d;"):
+        trainer.step()
+
+
+# Rates
+
+
+@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak), 1e30])
+def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(subject, tmp_path, factor):
+    """Finite ruins (100, 1e4) and overflow (1e30); before, the ruins were published."""
+    names = ("learning_rate", "plane_learning_rate", "pose_learning_rate")
+    rates = {name: factor * getattr(TINY, name) for name in names}
+    settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "warm_up": 1, "face": 0.0}
+    context = context_for(subject, tmp_path / "out", **settings, **rates)
+    with pytest.raises(UserError, match=r"training stopped: .*learning_rate.* checkpoint is kept, nothing"):
+        stage.run(context)
+    assert not list(context.output.iterdir())
+    saved = checkpoint_of(context)
+    assert saved.iteration in (1, 3) and all_finite(saved.tensors.values())
+
+
+def test_a_worse_avatar_is_refused_and_a_better_one_is_not():
+    require_progress(20.0, 17.1, 250, TINY)
+    with pytest.raises(UserError, match=r"after 250 iterations its pictures are worse .* 16\.9 dB of 20\.0"):
+        require_progress(20.0, 16.9, 250, TINY)
+
+
+# Long
+
+
+def drift(subject, tmp_path, count, **settings):
+    """The loss of every step, and the held-out PSNR at the end."""
+    trainer = trainer_for(context_for(subject, tmp_path, iterations=count, **settings))
+    taken = steps(trainer, count)
+    inputs = stage.read_inputs(context_for(subject, tmp_path))
+    return np.array(taken), trainer.held_out(inputs.whole, inputs.split.test)
+
+
+def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
+    half, single = (
+        drift(subject, tmp_path / name, 12, half_precision=name == "half") for name in ("half", "single")
+    )
+    assert np.abs(half[0] - single[0]).max() < 0.05 * single[0][0]
+    assert abs(half[1] - single[1]) < 0.5
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3000)
+def test_thousands_of_steps_on_one_frame(subject, tmp_path):
+    from pipeline.records import Split, write_split
+
+    place = spoilt(subject, tmp_path / "single")
+    write_split(place / "ingest" / "split.json", Split(train=(2,), test=(5,)))
+    count = int(os.environ.get("FLEXIAVATAR_SOAK_STEPS", "4000"))
+    trainer = trainer_for(context_for(place, tmp_path / "out", iterations=count))
+    taken = steps(trainer, count)
+    print(f"seed {TINY.seed}: loss {taken[0]:.4f} to {taken[-1]:.4f} in {count} steps")
+    assert taken[-1] < 0.5 * taken[0]
+
+
+def test_a_settled_run_stays_settled(subject, tmp_path):
+    """Nothing is left to learn: Adam's second moments fade, and its steps must not blow up."""
+    trainer = trainer_for(
+        context_for(subject, tmp_path / "out", iterations=40, final_rate=1.0, warm_up=1, face=0.0)
+    )
+    taken = steps(trainer, 40)
+    assert max(taken[20:]) < 1.5 * max(taken[:10])
