@@ -117,7 +117,7 @@ def write_layers(path: Path, layers: Layers) -> None:
     """
     half = layers.beauty.numpy().astype(np.float16)
     normal = layers.normal.numpy().astype(np.float16)
-    content = {
+    content: dict[str, dict[str, np.ndarray]] = {
         "beauty": {name: half[..., place] for place, name in enumerate("RGBA")},
         "alpha": {"A": half[..., 3]},
         "depth": {"Z": layers.depth.numpy().astype(np.float32)},

@@ -137,11 +137,12 @@ def drawn(
         spent: filled with the seconds that each frame took, by what.
     """
     settings: AnimateSettings = context.settings
-    gaussians = None
+    gaussians: Gaussians | None = None
     for frame, camera in enumerate(cameras):
         clock = _Clock(spent)
         fresh = gaussians is None or not script.still
-        gaussians = posed(script, actor, frame) if fresh else gaussians
+        if gaussians is None or fresh:
+            gaussians = posed(script, actor, frame)
         clock.note("pose")
         with torch.no_grad():
             rendering = render(gaussians, camera)
