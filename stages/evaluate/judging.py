@@ -127,11 +127,11 @@ class Judge:
     def composites(self, method: str, rendering: Rendering) -> list[Score]:
         """PSNR of a rendering under every composite: either background, its own alpha or the truth's mask."""
         truth, found = self.truth, []
-        both = [scored_picture(rendering, background) for background in (BLACK, WHITE)]
+        black, white = (scored_picture(rendering, background) for background in (BLACK, WHITE))
         for background in BACKGROUNDS:
             true = self._evidence.person(truth.frame, background)
             own = scored_picture(rendering, background)
-            masked = cut_out(*both, truth.mask, background)
+            masked = cut_out(black, white, truth.mask, background)
             for mask, image in (("own", own), ("truth", masked)):
                 found.append(truth.score(method, f"psnr_{background}_{mask}", psnr(image, true)))
         return found

@@ -3,10 +3,11 @@
 An avatar is judged under one mask and cannot know it at its edges; two good masks of one frame differ
 there. What the truth itself scores when a second mask cuts it out is what a perfect avatar could expect.
 
-- ``edge``: the same mask, one pixel smaller. Needs nothing, and is kind: both masks make the same mistakes.
+- ``edge``: the same mask, one pixel smaller: what a pixel of the outline is worth. Needs nothing, and knows
+  nothing of where masks go wrong.
 - ``estimator``: MediaPipe's own, frame by frame. It has two segmentations, of its pose model and of its
   selfie model, and the one that agrees better with the clip's masks is taken. The clip's masks are mostly
-  made of these two (``stages/ingest/masks.py``), so that this, too, is rather kind.
+  made of these two (``stages/ingest/masks.py``), so that this is rather kind.
 - a folder: anybody's, as grey pictures whose names are the frames' numbers.
 """
 

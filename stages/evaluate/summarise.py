@@ -68,7 +68,7 @@ def summarise(
             "stopped": list(refinement.stopped),
             "steps": refinement.steps,
         },
-        "protocol": protocol(choices, refinement, settings.protocol, gate),
+        "protocol": protocol(choices, refinement, settings.protocol),
     }
 
 

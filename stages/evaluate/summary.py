@@ -10,7 +10,6 @@ from rich.table import Table
 
 from pipeline.metrics import EROSION
 from pipeline.protocols import PROTOCOLS, TRUTH, Protocol
-from stages.evaluate.records import Gate
 from stages.evaluate.refinement import Refinement
 from stages.evaluate.scoring import AVATAR, CEILING, HELD_OUT, MEAN, MESH, NEAREST, REFINED, TRAINING
 
@@ -67,17 +66,16 @@ def show_summary(summary: Mapping[str, Any], report: str, console: Console | Non
     console.print(f"report: {report}", soft_wrap=True, highlight=False, markup=False)
 
 
-def protocol(choices: Protocol, refinement: Refinement, name: str = "", gate: Gate | None = None) -> str:
+def protocol(choices: Protocol, refinement: Refinement, name: str = "") -> str:
     """What the numbers were measured on, for tables and for ``summary.json``.
 
     Args:
         choices: what was chosen.
         refinement: of the test poses.
         name: of the protocol.
-        gate: what of the body is modelled.
     """
-    return " ".join(part for part in (_named(name, choices), *_composited(choices), _drawn(gate)) if part) + (
-        _refined(refinement)
+    return " ".join(
+        part for part in (_named(name, choices), *_composited(choices), _refined(refinement)) if part
     )
 
 
@@ -104,19 +102,11 @@ def _composited(choices: Protocol) -> list[str]:
     ]
 
 
-def _drawn(gate: Gate | None) -> str:
-    if gate is None or gate.kept >= gate.vertices:
-        return ""
-    return (
-        f"Gaussians stand on {gate.kept} of {gate.vertices} body vertices, as the visibility gate left them."
-    )
-
-
 def _refined(refinement: Refinement) -> str:
     if not refinement.poses:
         return ""
     return (
-        " Test poses refined: rotation, expression and translation of each held-out frame were fitted "
+        "Test poses refined: rotation, expression and translation of each held-out frame were fitted "
         f"to that frame itself ({refinement.steps} steps), all else fixed; the row without it is at the pose "
         "of the fit."
     )

@@ -134,14 +134,14 @@ def _some(summary: Mapping[str, Any], metrics: Sequence[str]) -> Table:
 
 def _row(summary: Mapping[str, Any], split: str, method: str, metrics: Sequence[str]) -> Row:
     cells = [_cell(summary, split, method, name) for name in metrics]
-    text = LABELS[split, method]
-    if method == CEILING:
-        text += f" ({summary['choices']['second_mask']})"
-    return Row(text, cells, (split, method) == (HELD_OUT, AVATAR))
+    return Row(LABELS[split, method], cells, (split, method) == (HELD_OUT, AVATAR))
 
 
 def _cell(summary: Mapping[str, Any], split: str, method: str, metric: str) -> Cell:
-    value = summary["means"][split][method].get(metric)
+    row = summary["means"][split][method]
+    if metric not in row:
+        return Cell("")
+    value = row[metric]
     ends = summary["intervals"].get(split, {}).get(method, {}).get(metric)
     span = (
         f"{number(metric, ends[0])} to {number(metric, ends[1])}"

@@ -81,7 +81,9 @@ def limits(summary: Mapping[str, Any], sides: Sides) -> str:
     fit = f" The fit is off by {sides.fit_pixels:.1f} px." if sides.fit_pixels is not None else ""
     if worth:
         return f"What limits it most: {'; then '.join(text for _, text in worth)}.{fit}"
-    return f"Nothing that was measured stands out as its limit.{fit}" if found else fit.strip()
+    ceiling = summary["means"].get(HELD_OUT, {}).get(CEILING, {}).get("psnr")
+    allowed = f"; masks would allow {ceiling:.1f} dB" if ceiling is not None else ""
+    return f"No single limit stands out{allowed}.{fit}" if found else fit.strip()
 
 
 def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
