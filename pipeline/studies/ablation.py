@@ -198,7 +198,13 @@ def tables_of(results: Results, sizes: str) -> list[Table]:
         "title": "What chance is worth: the whole method with another seed",
         "rows": [{"variant": FULL}, {"variant": CHANCE}],
     }
-    return [*tables, _table(chance, results, sizes)]
+    return [table for table in (*tables, _table(chance, results, sizes)) if not _empty(table)]
+
+
+def _empty(table: Table) -> bool:
+    """Whether nothing of a table was measured: what evaluate was not asked for."""
+    own = [value for row in table.rows for (_, source), value in row.values.items() if source == HERE]
+    return not any(math.isfinite(value) for value in own)
 
 
 def _table(about: Mapping[str, Any], results: Results, sizes: str) -> Table:
