@@ -21,7 +21,7 @@ from pipeline.errors import UserError
 from pipeline.job import job_from_words, shown, workspace_from_words
 from pipeline.settings import read_toml
 from pipeline.stage import Progress
-from pipeline.studies.run import Ending, Failure, base_words, run_variants, study_folder
+from pipeline.studies.run import Ending, Failure, base_words, run_variants, scale_words, study_folder
 from pipeline.studies.sizes import sizes_of, versions_of
 from pipeline.studies.tables import HERE, MEAN, PAPER, Column, Row, Table, Value, values_of
 from pipeline.study import Outcome, Variant
@@ -112,6 +112,7 @@ def ablate(name: str, subjects: Sequence[str], words: Mapping[str, str]) -> Path
     Raises:
         UserError: a word is wrong, or nothing at all could be made.
     """
+    scale_words(words)  # before anything is made
     workspace = workspace_from_words(words)
     folder, start = study_folder(workspace, "ablate", name), time.monotonic()
     endings = run_all(subjects, words, folder / "log.txt")
@@ -197,7 +198,13 @@ def tables_of(results: Results, sizes: str) -> list[Table]:
         "title": "What chance is worth: the whole method with another seed",
         "rows": [{"variant": FULL}, {"variant": CHANCE}],
     }
-    return [*tables, _table(chance, results, sizes)]
+    return [table for table in (*tables, _table(chance, results, sizes)) if not _empty(table)]
+
+
+def _empty(table: Table) -> bool:
+    """Whether nothing of a table was measured: what evaluate was not asked for."""
+    own = [value for row in table.rows for (_, source), value in row.values.items() if source == HERE]
+    return not any(math.isfinite(value) for value in own)
 
 
 def _table(about: Mapping[str, Any], results: Results, sizes: str) -> Table:

@@ -62,17 +62,23 @@ def base_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
     Raises:
         UserError: a word is wrong.
     """
-    scale = words.get("scale", "preset")
-    if scale not in SCALES:
-        raise UserError(f"scale={scale}: there is no such scale; there are {', '.join(SCALES)}")
+    scaled = scale_words(words)
     own = {name: value for name, value in words.items() if name not in OWN_WORDS}
-    settings = job_from_words(subject, {**SCALES[scale], **own}).settings
+    settings = job_from_words(subject, {**scaled, **own}).settings
     return {
         **lean_words(settings.get("evaluate")),
         **curve_words(settings.get("train")),
-        **SCALES[scale],
+        **scaled,
         **own,
     }
+
+
+def scale_words(words: Mapping[str, str]) -> Mapping[str, str]:
+    """What ``scale=`` stands for; UserError where there is no such scale."""
+    scale = words.get("scale", "preset")
+    if scale not in SCALES:
+        raise UserError(f"scale={scale}: there is no such scale; there are {', '.join(SCALES)}")
+    return SCALES[scale]
 
 
 def lean_words(evaluate: Any) -> dict[str, str]:

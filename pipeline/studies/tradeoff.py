@@ -152,9 +152,11 @@ def tradeoff(subject: str, words: Mapping[str, str]) -> Path:
         UserError: a word is wrong, or the base itself failed.
     """
     workspace, start = workspace_from_words(words), time.monotonic()
-    folder, own = study_folder(workspace, "tradeoff", subject), base_words(subject, words)
-    knobs = knobs_of(job_from_words(subject, own).settings)
-    budget = seconds_of(words.get("budget", DEFAULT_BUDGET))
+    budget, own = seconds_of(words.get("budget", DEFAULT_BUDGET)), base_words(subject, words)
+    knobs, folder = (
+        knobs_of(job_from_words(subject, own).settings),
+        study_folder(workspace, "tradeoff", subject),
+    )
     judge = Judging(words)
     explorer = Explorer(subject, own, knobs, budget, folder / "log.txt", judge)
     told = f"{len(singles(knobs))} levels of {len(knobs)} knobs, then what combines"

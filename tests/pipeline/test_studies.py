@@ -149,3 +149,15 @@ def test_what_was_noted_is_not_measured_again(tmp_path):
     assert len(asked) == 1
     (tmp_path / "notes" / "a.json").write_text("{")  # cut off
     assert notes.once("a", measure) == {"ms": 2.5} and len(asked) == 2
+
+
+def test_the_dag_refuses_what_a_study_cannot_be_told(toy):
+    for words, hint in (
+        (("tradeoff", "subject=ann", "budget=soon"), "no length of time"),
+        (("ablate", "subject=ann", "scale=huge"), "there are preset, small"),
+        (("ablate", "subject=nobody"), "there is no"),
+    ):
+        run = toy.doit(*words)
+        assert run.returncode != 0
+        assert hint in run.stdout + run.stderr and "Traceback" not in run.stdout + run.stderr
+    assert toy.ran() == [] and not (toy.data / "studies").exists()

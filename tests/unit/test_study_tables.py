@@ -1,5 +1,6 @@
 """A study's tables, plots and page."""
 
+import dataclasses
 import html.parser
 import json
 import math
@@ -137,6 +138,13 @@ def test_ablation_tables_say_what_is_the_same_and_what_failed(tmp_path):
     faces = tables["face_and_hands"].rows[0].values
     assert faces["psnr_face", HERE] == 25 and math.isnan(faces["psnr_hands", HERE])
     assert all("Sizes." in table.caption for table in tables.values())
+
+
+def test_what_evaluate_did_not_measure_has_no_table(tmp_path):
+    found = results(tmp_path)
+    bare = {key: outcome(tmp_path, key[1], psnr=30.0) for key in found.endings}
+    names = [table.name for table in tables_of(dataclasses.replace(found, endings=bare), "")]
+    assert "face_and_hands" not in names and {"runtime", "whole_body", "chance"} <= set(names)
 
 
 def test_the_papers_figures_stand_beside_the_same_dataset_alone(tmp_path):
