@@ -23,7 +23,8 @@ def split_frames(frames: Sequence[int], fraction: float, last: int) -> Split:
     count = last or (max(1, round(len(frames) * fraction)) if fraction > 0 else 0)
     if count >= len(frames):
         raise UserError(
-            f"{count} frames are to be held out of {len(frames)} that hold a person: lower ingest.test_frames"
+            f"{count} frames are to be held out of {len(frames)} that hold a person: "
+            "lower ingest.test_frames or ingest.test_fraction"
         )
     return Split(tuple(frames[: len(frames) - count]), tuple(frames[len(frames) - count :]))
 

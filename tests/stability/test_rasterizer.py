@@ -4,13 +4,17 @@ Every case is a change to a healthy scene, or another scene, rendered in single 
 """
 
 import math
+import sys
+import types
 
 import pytest
 import torch
 
 from pipeline.camera import Camera
 from pipeline.splat import Gaussians, render
-from tests.unit.splat_scene import NAMES, draw, images, scene
+from pipeline.splat.gsplat_backend import render_gsplat
+from tests.unit.splat_scene import NAMES, draw, images, leaves, scene
+from tests.unit.test_splat_gsplat import rasterization
 
 COUNT = 20
 BACKENDS = ["numba", "dense"]
@@ -181,3 +185,59 @@ def test_a_camera_that_is_not_finite_shows_nothing(backend):
     gaussians, camera = healthy()
     broken = Camera(40, 24, camera.intrinsics, camera.rotation * math.nan, camera.translation)
     assert not render(gaussians, broken, backend).color.any()
+
+
+# Sums that overflow, and what gsplat must never be given
+
+
+@pytest.mark.parametrize("value", [1e3, 1e30, -1e30, 3e38])
+def test_colours_beyond_their_range_are_drawn_or_left_out_finite(value):
+    gaussians, camera = spoilt("colors", first(value, 3))
+    rendering = render(gaussians, camera)
+    assert rendering.color.isfinite().all() and rendering.alpha.isfinite().all()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-9, 1.0, 1e3, 1e9, 1e18])
+@pytest.mark.parametrize("axes", [1, 3], ids=["one axis", "all axes"])
+def test_scales_from_nothing_to_1e18(size, axes):
+    gaussians, camera = spoilt("scales", [size] * axes + [0.1] * (3 - axes))
+    for backend in BACKENDS:
+        assert_finite(*draw(gaussians, camera, backend))
+
+
+@pytest.mark.parametrize("depth", [-1.0, 0.0, 1e-30, 0.00999, 0.01, 0.0100001, 0.02, 1e3, 1e9, 1e11])
+def test_depths_from_behind_the_camera_to_beyond_the_far_plane(depth):
+    gaussians, camera = spoilt("means", in_camera([1e-4, 0.0, depth]))
+    for backend in BACKENDS:
+        assert_finite(*draw(gaussians, camera, backend))
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-30, 1e-15, 1e-11, 1.0, 1e10, 1e13, 1e19, 3e38])
+def test_quaternions_of_any_length(length):
+    gaussians, camera = healthy()
+    gaussians.quaternions[0] *= length / gaussians.quaternions[0].norm()
+    for backend in BACKENDS:
+        assert_finite(*draw(gaussians, camera, backend))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33)])
+def test_none_and_one_in_small_images(count, size):
+    gaussians, camera = healthy()
+    gaussians = gaussians.select(torch.arange(count))
+    camera = Camera(*size, camera.intrinsics, camera.rotation, camera.translation)
+    for backend in BACKENDS:
+        assert_finite(*draw(gaussians, camera, backend))
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_what_gsplat_fails_on_never_reaches_it(case, monkeypatch):
+    """gsplat lets NaN through its projection and draws it: a stand-in refuses to be given any."""
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
+    gaussians, camera = spoilt(*UNUSABLE[case])
+    moved, moved_camera, tensors = leaves(gaussians, camera)
+    rendering = render_gsplat(moved, moved_camera)
+    sum(image.square().sum() for image in images(rendering)).backward()
+    assert all(image.isfinite().all() for image in images(rendering)) and rendering.weights[0] == 0
+    assert all(tensor.grad.isfinite().all() for tensor in tensors)
+    assert not tensors[0].grad[0].any()

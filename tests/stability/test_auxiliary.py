@@ -1,0 +1,110 @@
+"""Views the camera never saw, of clips that show next to nothing."""
+
+import json
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+
+from pipeline.errors import UserError
+from pipeline.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.records import Split, read_cameras, write_split
+from stages.auxiliary import run as stage
+from stages.auxiliary.texture.complete import membrane, neighbours
+from stages.auxiliary.texture.project import robust_mean, weighted_median
+from stages.auxiliary.texture.shade import shading
+from tests.stages.auxiliary_subject import FRAMES, context_for, write_clip
+
+SIZE = 48
+
+
+def clip_of(folder, framing="full"):
+    return write_clip(folder, framing, SIZE)
+
+
+def ran(place, output, **changes):
+    context = context_for(place, output, generator="texture", frames=4, width=72, height=128, **changes)
+    stage.run(context)
+    return context
+
+
+def assert_published(context):
+    """Pictures that are there are pictures, their cameras finite."""
+    record = json.loads((context.output / "auxiliary.json").read_text())
+    assert record
+    path = context.output / "cameras.parquet"
+    for frame, camera in read_cameras(path).items() if path.exists() else ():
+        assert camera.intrinsics.isfinite().all()
+        assert read_frame(context.output / "frames", frame).dtype == np.uint8
+
+
+@pytest.mark.parametrize("value", [0, pytest.param(255, marks=pytest.mark.soak)], ids=["black", "white"])
+def test_flat_frames_are_painted_flat(tmp_path, value):
+    place = clip_of(tmp_path / "clip")
+    for frame in range(FRAMES):
+        write_frame(place / "ingest" / "frames", frame, np.full((SIZE, SIZE, 3), value, np.uint8))
+    context = ran(place, tmp_path / "out")
+    assert_published(context)
+    for path in sorted((context.output / "frames").glob("*.png")):
+        number = int(path.stem)
+        seen = read_mask(context.output / "masks", number) > 250
+        assert (
+            np.abs(read_frame(context.output / "frames", number)[seen].astype(int) - value).max(initial=0)
+            <= 60
+        )
+
+
+def test_empty_masks_everywhere_publish_nothing_or_say_so(tmp_path):
+    place = clip_of(tmp_path / "clip")
+    for frame in range(FRAMES):
+        write_mask(place / "ingest" / "masks", frame, np.zeros((SIZE, SIZE), np.uint8))
+    try:
+        assert_published(ran(place, tmp_path / "out"))
+    except UserError as error:
+        assert "mask" in str(error) or "nobody" in str(error)
+
+
+def test_one_training_frame(tmp_path):
+    place = clip_of(tmp_path / "clip")
+    write_split(place / "ingest" / "split.json", Split((0,), ()))
+    assert_published(ran(place, tmp_path / "out"))
+
+
+# The texture's parts
+
+
+def test_a_membrane_without_anything_fixed_takes_its_rest():
+    chain = neighbours(np.array([[0, 1], [1, 2]]), 4)  # and a vertex without neighbours
+    rest = np.array([10.0, 20.0, 30.0])
+    found = membrane(chain, np.zeros((4, 3)), np.zeros(4, bool), rest)
+    np.testing.assert_allclose(found, np.tile(rest, (4, 1)), rtol=0.02)
+    start = membrane(chain, np.zeros((4, 3)), np.zeros(4, bool), rest, np.zeros((4, 3)))
+    assert np.isfinite(start).all()
+
+
+def test_a_membrane_of_everything_fixed_changes_nothing():
+    values = np.arange(6.0).reshape(3, 2)
+    found = membrane(sparse.csr_matrix((3, 3)), values, np.ones(3, bool), np.zeros(2))
+    np.testing.assert_array_equal(found, values)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-30, 1.0, 1e30])
+def test_means_of_any_weights_are_colours(weight):
+    colors = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    weights = np.full((5, 7), weight, np.float32)
+    for found in (weighted_median(colors[..., 0], weights), robust_mean(colors, weights)):
+        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 255
+
+
+@pytest.mark.parametrize("case", ["black", "no normals", "no weight", "one normal"])
+def test_light_of_what_has_none_is_finite(case):
+    count = 60
+    rng = np.random.default_rng(0)
+    color = (rng.uniform(0, 255, (count, 3)) * (case != "black")).astype(np.float32)
+    normal = rng.normal(size=(count, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.zeros_like(normal) if case == "no normals" else normal
+    normal = np.tile(normal[:1], (count, 1)) if case == "one normal" else normal
+    weight = np.zeros(count, np.float32) if case == "no weight" else np.ones(count, np.float32)
+    found = shading(color, weight, normal, np.zeros(count, np.int64))
+    assert np.isfinite(found).all() and np.isfinite(np.exp(found)).all()
