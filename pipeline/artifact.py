@@ -1,7 +1,8 @@
 """The versioned store: what a stage publishes, under a key that says what it was made from.
 
 ``<root>/<subject>/<stage>/<key>/`` holds one version; it never changes once it is there. ``latest``
-beside the versions is a link to the one in use. Work happens in ``.scratch-<key>`` beside them and
+beside the versions is a link to the one in use. Every byte of a version is covered by a digest: its files by
+``manifest.json``, that and ``run.json`` by ``SHA256SUMS``. Work happens in ``.scratch-<key>`` beside them and
 becomes visible by one rename, so a reader never meets half a version, whatever kills the writer.
 """
 

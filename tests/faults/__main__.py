@@ -32,6 +32,9 @@ from tests.faults.project import real_project
 def main(arguments: list[str] | None = None) -> int:
     """Runs the campaign; returns 1 where anything was lost."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
+    if sys.platform != "linux":
+        print("faults: only Linux shows processes in the way that this watches them", file=sys.stderr)
+        return 1
     kills = 14 if options.quick else options.kills
     keep = Path(tempfile.mkdtemp(prefix="flexiavatar-faults-"))
     project = real_project(keep / "project", options.assets.resolve())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import os
@@ -54,6 +55,7 @@ class Run:
             project.command(*tasks), cwd=REPOSITORY, env=project.environment(), start_new_session=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
         )  # fmt: skip
+        atexit.register(self.kill, "group")  # whoever stops the campaign stops its run too
         self.reader = threading.Thread(target=self._read, daemon=True)
         self.reader.start()
 

@@ -1,6 +1,9 @@
 """The campaign itself on toy stages: a few kills, and that it notices what it is there to notice."""
 
 import shutil
+import sys
+
+import pytest
 
 from tests.faults.__main__ import headline, report
 from tests.faults.campaign import CORRUPT, DIFFERENT, MANUAL, Campaign, Tally, plan, undisturbed
@@ -9,6 +12,7 @@ from tests.faults.project import Project
 from tests.faults.runs import MOMENTS, TARGETS, Run
 from tests.pipeline.conftest import ToyProject
 
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="it watches processes as Linux shows them")
 STAGES = ("gather", "bend", "paint")
 SEED = 3
 
