@@ -85,9 +85,9 @@ def run(context: Context) -> None:
 
 
 def make_mesh(context: Context, evidence: Evidence, body: BodyModel) -> TexturedMesh | None:
-    """The textured mesh, where it was asked for and any frame is held out to compare it in."""
+    """The textured mesh, where it was asked for and there is anything to compare it in."""
     settings: EvaluateSettings = context.settings
-    if not settings.mesh_frames:
+    if not settings.mesh_frames or not (evidence.split.test or view_folders(evidence)):
         return None
     start = time.monotonic()
     identity = read_identity(context.inputs["fit"] / "identity.safetensors", body)
@@ -156,17 +156,15 @@ def evaluate(
     summary["gaussians"] = len(relaxed)
     summary["verdict"] = verdict(summary, sides(context, plan, gate))
     write_json(context.output / "summary.json", summary)
-    own = StageRecord(
-        name=STAGE.name,
-        settings=as_dict(settings),
-        seconds=time.monotonic() - start,
-        memory=peak_memory(),
-        version=STAGE.version,
-        made="this run",
-    )
+    own = own_record(settings, time.monotonic() - start)
     material = gather(context, evidence, assessment, (plan, refinement, gate), summary, cover, own)
     write_report(context.output / "report.html", material)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def own_record(settings: EvaluateSettings, seconds: float) -> StageRecord:
+    """What the report says of the stage that writes it."""
+    return StageRecord(STAGE.name, as_dict(settings), seconds, peak_memory(), STAGE.version, "this run")
 
 
 def sides(context: Context, plan: Plan, gate: Gate) -> Sides:
