@@ -24,6 +24,7 @@ from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context
 from pipeline.versions import versions
+from stages.evaluate import STAGE
 from stages.evaluate.assessment import Assessment, Extras, assess, scored_frames
 from stages.evaluate.curve import draw_curve, draw_fit, draw_scores
 from stages.evaluate.evidence import Evidence, evenly, read_evidence
@@ -67,6 +68,7 @@ def run(context: Context) -> None:
         UserError: a file of an upstream stage or an asset is missing or damaged.
     """
     settings: EvaluateSettings = context.settings
+    start = time.monotonic()
     body = load_body(context.body_file)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", body)
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
@@ -79,13 +81,13 @@ def run(context: Context) -> None:
     )
     scorer = Scorer(networks, settings.choices.background)
     views = score_other_cameras(context, evidence, animate, body, mesh)
-    evaluate(context, evidence, animate, follower(avatar), scorer, extras, views)
+    evaluate(context, evidence, animate, follower(avatar), scorer, extras, views, start)
 
 
 def make_mesh(context: Context, evidence: Evidence, body: BodyModel) -> TexturedMesh | None:
-    """The textured mesh, where it was asked for and any frame is held out to compare it in."""
+    """The textured mesh, where it was asked for and there is anything to compare it in."""
     settings: EvaluateSettings = context.settings
-    if not settings.mesh_frames:
+    if not settings.mesh_frames or not (evidence.split.test or view_folders(evidence)):
         return None
     start = time.monotonic()
     identity = read_identity(context.inputs["fit"] / "identity.safetensors", body)
@@ -117,6 +119,7 @@ def evaluate(
     scorer: Scorer,
     extras: Extras | None = None,
     views: list[Score] | None = None,
+    start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
 
@@ -128,10 +131,10 @@ def evaluate(
         scorer: the metrics.
         extras: what else is judged, or judges.
         views: scores in cameras that are not the clip's.
+        start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
-    extras = extras or Extras()
-    start = time.monotonic()
+    extras, start = extras or Extras(), time.monotonic() if start is None else start
     plan, gate = read_plan(context.inputs["plan"] / "plan.json"), read_gate(context.inputs["train"])
     refinement = refine_test_poses(context, evidence, plan, follow, scorer.background)
     scoring = time.monotonic()
@@ -153,10 +156,15 @@ def evaluate(
     summary["gaussians"] = len(relaxed)
     summary["verdict"] = verdict(summary, sides(context, plan, gate))
     write_json(context.output / "summary.json", summary)
-    own = StageRecord("evaluate", as_dict(settings), time.monotonic() - start, peak_memory(), made="this run")
+    own = own_record(settings, time.monotonic() - start)
     material = gather(context, evidence, assessment, (plan, refinement, gate), summary, cover, own)
     write_report(context.output / "report.html", material)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def own_record(settings: EvaluateSettings, seconds: float) -> StageRecord:
+    """What the report says of the stage that writes it."""
+    return StageRecord(STAGE.name, as_dict(settings), seconds, peak_memory(), STAGE.version, "this run")
 
 
 def sides(context: Context, plan: Plan, gate: Gate) -> Sides:
