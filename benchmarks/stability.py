@@ -35,7 +35,6 @@ from stages.fit import optimise, parameters
 from stages.fit.doubt import without_doubted
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
-from stages.fit.smoothing import smooth
 from stages.ingest.mannequin import MannequinSpec
 
 WORDS = {True: "kept", False: "dropped"}
@@ -233,10 +232,6 @@ def precision(repeats: int) -> Iterator[Cost]:
     yield Cost(
         "SSIM of a flat image in float64", narrow, wide / narrow - 1, True, f"float32 is {off:.1e} off"
     )
-    poses = Poses(tuple(range(300)), 0.3 * torch.randn(300, 55, 3, generator=generator), torch.zeros(300, 50),
-                  torch.zeros(300, 3))  # fmt: skip
-    (time_,) = least(repeats, lambda: smooth(poses, 5))
-    yield Cost("smoothing of 300 frames in float64", time_, 0.0, True, "milliseconds in all")
 
 
 def single_ssim(image: Tensor, truth: Tensor) -> float:
