@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -35,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     if sys.platform != "linux":
         print("faults: only Linux shows processes in the way that this watches them", file=sys.stderr)
         return 1
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that its run is stopped too
     kills = 14 if options.quick else options.kills
     keep = Path(tempfile.mkdtemp(prefix="flexiavatar-faults-"))
     project = real_project(keep / "project", options.assets.resolve())

@@ -17,7 +17,7 @@ from tests.faults.observe import differences, litter, phase, published, wrongs
 from tests.faults.project import Project
 from tests.faults.runs import MOMENTS, TARGETS, Kill, Run
 
-A_STAGE = 2  # kills of each stage, and of doit's start, before a run is let through
+A_STAGE = 3  # kills of each stage, and of doit's start, before a run is let through
 PATIENCE = 10.0  # seconds for a stage to end after doit was killed
 SHARES = (0.8, 0.1, 0.1)  # of the targets
 IN_PUBLISHING = 0.3  # of the kills that wait for a step of publishing
