@@ -30,6 +30,7 @@ from stages.animate.settings import AnimateSettings
 from stages.animate.sheet import contact_sheet
 
 _HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
+_WORTH_BAKING = 24  # poses; baking 54,000 Gaussians takes as long as it saves in about so many
 _SHOWN = 12  # joints named in a line
 
 
@@ -48,7 +49,7 @@ def run(context: Context) -> None:
     legs = legs_share(avatar, body)
     script = written(context, avatar, body, legs)
     start = time.monotonic()
-    actor = actor_of(context, avatar)
+    actor = actor_of(context, avatar, script)
     context.timing("decode_seconds", time.monotonic() - start)
     cameras = shots(context, script, actor, body)
     film(context, script, actor, cameras)
@@ -76,14 +77,16 @@ def in_place(settings: AnimateSettings, legs: float) -> bool:
     return settings.way == "still" or (settings.way == "auto" and legs < _HALF_LEGS)
 
 
-def actor_of(context: Context, avatar: Avatar) -> Actor:
+def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
     """The avatar, ready to be moved."""
     settings: AnimateSettings = context.settings
+    poses = 1 if script.still else len(script)
+    baking = settings.bake == "on" or (settings.bake == "auto" and poses >= _WORTH_BAKING)
     known = None
     if settings.heads == "known":
         train = read_split(context.inputs["ingest"] / "split.json").train
         known = Known.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
-    return make_actor(avatar, settings.bake, settings.unseen, known)
+    return make_actor(avatar, baking, settings.unseen, known)
 
 
 def posed(script: Script, actor: Actor, frame: int) -> Gaussians:

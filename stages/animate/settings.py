@@ -17,6 +17,7 @@ _CHOICES = {
     "way": ("auto", "kept", "still"),
     "heads": ("known", "free"),
     "unseen": ("auto", "nothing", "base"),
+    "bake": ("auto", "on", "off"),
 }
 
 
@@ -54,8 +55,9 @@ class AnimateSettings:
     up: str = "auto"
     # Behind the video's person: grey, black, white, green, or #rrggbb. OpenEXR has an alpha instead.
     background: str = "grey"
-    # Whether what does not depend on the pose is computed once (pipeline/avatar/bake.py).
-    bake: bool = True
+    # Whether all that does not depend on the pose is computed beforehand (pipeline/avatar/bake.py): on, off,
+    # or auto: from 24 poses on, where it pays (docs/results.md).
+    bake: str = "auto"
     # Frames of a turntable, its frames a second, and how far its arms hang below the T pose, in radians: the
     # paper's supplement turns the T pose.
     turntable_frames: int = 90

@@ -174,7 +174,7 @@ def test_layers_of_two_flat_discs_by_hand():
 def test_a_subjects_own_clip_filmed_from_where_it_was_is_the_clip_again(studio):
     """Driven by its own fit, the avatar stands before its own camera as it did."""
     context = studio.animate(
-        "own", motion="subject:doll", camera="clip", way="kept", heads="free", outputs=("ply",), bake=False,
+        "own", motion="subject:doll", camera="clip", way="kept", heads="free", outputs=("ply",), bake="off",
         loans={stage: studio.root / stage for stage in ("ingest", "fit")},
     )  # fmt: skip
     avatar, poses = awake_avatar(), moving_poses()
@@ -247,10 +247,10 @@ def test_without_legs_nobody_walks_and_what_was_not_seen_is_not_shown(half, walk
     assert float((still[1] - still[0]).norm()) < 0.5 * float((moving[1] - moving[0]).norm())
 
 
-@pytest.mark.parametrize("baked", [True, False])
-def test_the_unseen_body_can_be_shown_in_its_base_colours(half, walk, baked):
+@pytest.mark.parametrize("baking", ["on", "off"])
+def test_the_unseen_body_can_be_shown_in_its_base_colours(half, walk, baking):
     context = half.animate(
-        f"base{baked}", motion=str(walk), outputs=("exr",), unseen="base", last_frame=0, bake=baked
+        f"base-{baking}", motion=str(walk), outputs=("exr",), unseen="base", last_frame=0, bake=baking
     )
     assert about(context)["gaussians"] == len(load_body(BODY_FILE).v_template)
     part = read_exr(context.output / "exr" / "000000.exr")["part"]["ID"]
@@ -279,9 +279,10 @@ def test_how_much_of_the_legs_there_is():
 
 
 def test_baked_or_not_the_picture_is_the_same(studio, walk, everything):
-    plain = studio.animate("unbaked", motion=str(walk), outputs=("ply",), bake=False)
+    baked = studio.animate("baked", motion=str(walk), outputs=("ply",), bake="on")
+    assert about(baked)["baked"] and not about(everything)["baked"]  # five poses do not pay for it
     for frame in (0, 1):
-        ours, theirs = filmed(plain, frame), filmed(everything, frame)
+        ours, theirs = filmed(baked, frame), filmed(everything, frame)
         assert float((ours[0].means - theirs[0].means).abs().max()) < 2e-3
         assert float((render(ours[0], ours[1]).color - render(theirs[0], ours[1]).color).abs().mean()) < 5e-3
 
