@@ -20,7 +20,8 @@ from typing import Any
 from pipeline.plan import AZIMUTH_STEP
 from stages.evaluate.scoring import AVATAR, BASELINES, CEILING, HELD_OUT, MESH, NEAREST, REFINED, TRAINING
 
-CLEAR = 0.5  # dB under which a cause is not worth naming
+LEVEL = 1.0  # dB within which an interval about zero means that there is no difference
+CLEAR = 1.0  # dB under which a cause is not worth naming
 NEAR_CEILING = 1.5  # dB between avatar and ceiling, under which masks are what is measured
 PARTS = 3.0  # dB by which a part must be worse than the whole person to be named
 NAMED = 2  # causes
@@ -69,8 +70,11 @@ def quality(summary: Mapping[str, Any]) -> str:
         verb = f"{gain['mean']:.1f} dB better than {_OVER[rival]} ({span})"
     elif gain["high"] < 0:
         verb = f"{-gain['mean']:.1f} dB worse than {_OVER[rival]} ({span})"
-    else:
+    elif max(-gain["low"], gain["high"]) < LEVEL:
         verb = f"Level with {_OVER[rival]} ({gain['mean']:+.1f} dB, {span})"
+    else:
+        few = f"which {summary['frames'][HELD_OUT]} held-out frames do not settle"
+        verb = f"{gain['mean']:+.1f} dB against {_OVER[rival]}, {few} ({span})"
     return f"{verb}: {score}{_sharpness(means, rival)}."
 
 
