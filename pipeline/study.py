@@ -19,7 +19,7 @@ from pipeline.artifact import RUN, Artifact
 from pipeline.errors import UserError
 from pipeline.job import Job, job_from_words, words_to_dict
 from pipeline.process import run_stage_process
-from pipeline.stage import usual
+from pipeline.stage import Stage, usual
 
 SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
 
@@ -65,7 +65,13 @@ class Outcome:
         return float("nan") if value is None else float(value)
 
 
-def outcome_of(subject: str, variant: Variant, words: Mapping[str, str], log: Path | None = None) -> Outcome:
+def outcome_of(
+    subject: str,
+    variant: Variant,
+    words: Mapping[str, str],
+    log: Path | None = None,
+    stages: Iterable[str] | None = None,
+) -> Outcome:
     """Runs what is not in the store yet, and reads what the variant came to.
 
     ``latest`` is left pointing where it pointed before.
@@ -75,11 +81,20 @@ def outcome_of(subject: str, variant: Variant, words: Mapping[str, str], log: Pa
         variant: the settings that differ.
         words: the study's own words, which the variant's replace.
         log: where the stages' own lines go; this terminal if None.
+        stages: how far to go, as for ``made``; without evaluate there are no means.
 
     Raises:
         UserError: a setting is wrong, or a stage stopped.
     """
-    return _read(subject, variant, made(job_from_words(subject, {**words, **variant.words}), log=log))
+    return _read(subject, variant, made(job_from_words(subject, {**words, **variant.words}), stages, log))
+
+
+def with_needed(stages: Mapping[str, Stage], wanted: Iterable[str]) -> list[str]:
+    """Some stages and all that they need, upstream first."""
+    found = set(wanted)
+    for name in reversed(list(stages)):
+        found |= set(stages[name].needs) if name in found else set()
+    return [name for name in stages if name in found]
 
 
 def made(job: Job, stages: Iterable[str] | None = None, log: Path | None = None) -> dict[str, Artifact]:
@@ -95,12 +110,9 @@ def made(job: Job, stages: Iterable[str] | None = None, log: Path | None = None)
     Raises:
         UserError: a stage stopped.
     """
-    wanted = set(usual(job.stages) if stages is None else stages)
-    for stage in reversed(job.stages):
-        wanted |= set(job.stages[stage].needs) if stage in wanted else set()
     found = {}
     with _latest_kept(job):
-        for stage in (name for name in job.stages if name in wanted):
+        for stage in with_needed(job.stages, usual(job.stages) if stages is None else stages):
             if job.find(stage) is None:
                 _run(job, stage, log)
             artifact = job.find(stage)

@@ -26,8 +26,8 @@ from pipeline.studies.design import (
 )
 from pipeline.studies.fits import FitPoint, fit_point, fit_steps
 from pipeline.studies.knobs import Knob
-from pipeline.studies.run import Ending, Failure, attempt, line
-from pipeline.study import Outcome, Variant
+from pipeline.studies.run import Ending, Failure, attempt
+from pipeline.study import Outcome, Variant, with_needed
 from pipeline.workspace import Workspace
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -122,7 +122,7 @@ class Explorer:
         """The stages of a point that the store does not hold."""
         job = self.job(point)
         found: Found = {}
-        return [stage for stage in job.stages if job.find(stage, found) is None]
+        return [stage for stage in with_needed(job.stages, (TRAIN,)) if job.find(stage, found) is None]
 
     def made(self) -> list[Made]:
         """The points so far, as the design sees them."""
@@ -140,15 +140,23 @@ class Explorer:
         needed = self.needed(point)
         expected = Design(self.knobs, self.made()).seconds(point, needed)
         start = time.monotonic()
-        ending = attempt(self.subject, self.variant(point), self.own, self.log)
+        ending = attempt(self.subject, self.variant(point), self.own, self.log, (TRAIN,))
         if isinstance(ending, Outcome):
             self._qualities[point] = self.judge(ending)
             if expected:
                 self._took += time.monotonic() - start
                 self._expected += expected
         self.endings[point] = ending
-        self.say(f"[{spoken(self.spent)} of {spoken(self.budget)}, {self.left_text()}] {line(ending)}")
+        self.tell(ending, self._qualities.get(point, math.nan), f", {self.left_text()}")
         return ending
+
+    def tell(self, ending: Ending, quality: float, left: str = "") -> None:
+        """A line on what was made."""
+        text = f"[{spoken(self.spent)} of {spoken(self.budget)}{left}] {self.subject}, {ending.variant}: "
+        if isinstance(ending, Failure):
+            self.say(f"{text}failed: {ending.reason}")
+        else:
+            self.say(f"{text}{quality:.2f} dB, trained in {cost_of(ending):.0f} processor seconds")
 
     def left_text(self) -> str:
         """What is still to come of the levels tried alone, at most what is left of the budget."""
@@ -214,27 +222,18 @@ def presets_of(explorer: Explorer, words: Mapping[str, str], workspace: Workspac
         if not isinstance(base, Outcome):
             continue
         own = {**{key: value for key, value in words.items() if "." not in key}, "preset": path.stem}
-        lean = {key: value for key, value in explorer.own.items() if key.startswith("evaluate.")}
-        job = job_from_words(explorer.subject, {**own, **lean})
+        job = job_from_words(explorer.subject, own)
         cost = expected_cost(explorer, job, base)
-        full = job_from_words(explorer.subject, own)
-        stored = full if full.find("evaluate") else job if job.find("evaluate") else None
         left = (explorer.budget - explorer.spent) / 2
         share = sum(base.seconds.values()) / max(cost_of(base), 1e-9)
-        if stored is None and explorer.slowness * cost * share > left:
+        if job.find(TRAIN) is None and explorer.slowness * cost * share > left:
             found.append(Preset(path.stem, cost))
             continue
-        ending = attempt(
-            explorer.subject,
-            Variant(f"preset {path.stem}"),
-            {**own, **({} if stored is full else lean)},
-            explorer.log,
-        )
-        explorer.say(f"[{spoken(explorer.spent)} of {spoken(explorer.budget)}] {line(ending)}")
-        if isinstance(ending, Failure):
-            found.append(Preset(path.stem, cost))
-        else:
-            found.append(Preset(path.stem, cost_of(ending), ending))
+        ending = attempt(explorer.subject, Variant(f"preset {path.stem}"), own, explorer.log, (TRAIN,))
+        quality = explorer.judge(ending) if isinstance(ending, Outcome) else math.nan
+        explorer.tell(ending, quality)
+        done = isinstance(ending, Outcome)
+        found.append(Preset(path.stem, cost_of(ending), ending) if done else Preset(path.stem, cost))
     return found
 
 

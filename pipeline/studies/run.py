@@ -63,7 +63,7 @@ def base_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
         UserError: a word is wrong.
     """
     scaled = scale_words(words)
-    own = {name: value for name, value in words.items() if name not in OWN_WORDS}
+    own = stage_words(words)
     settings = job_from_words(subject, {**scaled, **own}).settings
     return {
         **lean_words(settings.get("evaluate")),
@@ -71,6 +71,12 @@ def base_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
         **scaled,
         **own,
     }
+
+
+def stage_words(words: Mapping[str, str]) -> dict[str, str]:
+    """The command line's words that concern the stages; a dataset's, where it is said whose avatar."""
+    own = {name: value for name, value in words.items() if name not in OWN_WORDS}
+    return {**own, "dataset": words["dataset"]} if {"subject", "dataset"} <= set(words) else own
 
 
 def scale_words(words: Mapping[str, str]) -> Mapping[str, str]:
@@ -93,10 +99,16 @@ def curve_words(train: Any) -> dict[str, str]:
     return {"train.held_out_every": str(min(train.held_out_every, max(1, train.iterations // 5)))}
 
 
-def attempt(subject: str, variant: Variant, words: Mapping[str, str], log: Path) -> Ending:
-    """What one variant came to, or why it came to nothing."""
+def attempt(
+    subject: str,
+    variant: Variant,
+    words: Mapping[str, str],
+    log: Path,
+    stages: Iterable[str] | None = None,
+) -> Ending:
+    """What one variant came to, or why it came to nothing; ``stages`` as for ``pipeline.study.made``."""
     try:
-        return outcome_of(subject, variant, words, log)
+        return outcome_of(subject, variant, words, log, stages)
     except (UserError, OSError) as error:
         return Failure(subject, variant.name, str(error))
 

@@ -22,13 +22,11 @@ from pipeline.studies.explore import (
 from pipeline.studies.fits import FitPoint
 from pipeline.studies.frontier import frontier, short_of
 from pipeline.studies.knobs import CHANCE, Knob, knobs_of
-from pipeline.studies.run import OWN_WORDS, Failure, base_words, study_folder
+from pipeline.studies.run import Failure, base_words, stage_words, study_folder
 from pipeline.study import Outcome
 
 if TYPE_CHECKING:
     from pipeline.studies.clip import Clip
-
-QUALITY = ("psnr", "psnr_interior", "ssim", "lpips_alex")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,12 +62,16 @@ class Entry:
         return self.quality.get(metric, math.nan)
 
     @property
+    def gaussians(self) -> float:
+        """Of the avatar; NaN where there is none."""
+        return self.speed.get("gaussians", math.nan)
+
+    @property
     def whole(self) -> float:
-        """Processor seconds of every stage but evaluate, of those that noted them."""
-        if self.outcome is None:
-            return math.nan
-        known = [value for stage, value in self.outcome.cpu_seconds.items() if stage != "evaluate"]
-        return sum(value for value in known if math.isfinite(value))
+        """Processor seconds of every stage up to training, of those that noted them."""
+        seconds = self.outcome.cpu_seconds.values() if self.outcome else ()
+        known = [value for value in seconds if math.isfinite(value)]
+        return sum(known) if known else math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,8 +163,7 @@ def tradeoff(subject: str, words: Mapping[str, str]) -> Path:
     explorer = Explorer(subject, own, knobs, budget, folder / "log.txt", judge)
     told = f"{len(singles(knobs))} levels of {len(knobs)} knobs, then what combines"
     print(f"tradeoff of {subject}: {told}, within {words.get('budget', DEFAULT_BUDGET)}", flush=True)
-    asked = {name: value for name, value in words.items() if name not in OWN_WORDS}
-    presets = explore(explorer, asked, workspace)
+    presets = explore(explorer, stage_words(words), workspace)
     study = gathered(explorer, presets, judge, words, time.monotonic() - start)
 
     from pipeline.studies.tradeoff_report import publish
@@ -172,7 +173,10 @@ def tradeoff(subject: str, words: Mapping[str, str]) -> Path:
 
 
 class Judging:
-    """Held-out quality at the base's picture size: evaluate's own numbers, measured here for other sizes."""
+    """Held-out quality at the base's picture size, by evaluate's metrics but without that stage's pictures.
+
+    Evaluate would cost as much as a short training; and it measures at the size that was learnt from.
+    """
 
     def __init__(self, words: Mapping[str, str]) -> None:
         self.words = words
@@ -190,8 +194,6 @@ class Judging:
     def qualities(self, outcome: Outcome) -> dict[str, float]:
         """Metric -> mean over the base's held-out frames."""
         base = self.base = self.base or outcome
-        if outcome.folders["ingest"].name == base.folders["ingest"].name:
-            return {metric: outcome.held_out(metric) for metric in QUALITY}
         from pipeline.studies.clip import quality, quality_name
         from pipeline.studies.measured import notes_of
 
@@ -294,8 +296,8 @@ def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = T
     place = next(place for place, level in enumerate(entry.point or ()) if level)
     knob = study.knobs[place]
     before, after = knob.levels[0].label, knob.levels[(entry.point or ())[place]].label
-    if knob.name == "number of Gaussians" and entry.outcome and study.base.outcome:
-        before, after = (f"{one.gaussians:,} Gaussians" for one in (study.base.outcome, entry.outcome))
+    if knob.name == "number of Gaussians" and math.isfinite(entry.gaussians + study.base.gaussians):
+        before, after = (f"{one.gaussians:,.0f} Gaussians" for one in (study.base, entry))
     time = f"{ratio:.1f} times the training time" if abs(ratio - 1) > 0.05 else "no more training time"
     start = "Going from" if first else "going from"
     return f"{start} {before} to {after}, at {time}: {gain:+.1f} dB"
@@ -303,5 +305,4 @@ def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = T
 
 def told_size(study: Study, entry: Entry) -> str:
     """An entry's size in words."""
-    gaussians = entry.outcome.gaussians if entry.outcome else 0
-    return f"{gaussians:,} Gaussians and {study.knobs[0].levels[0].label}"
+    return f"{entry.gaussians:,.0f} Gaussians and {study.knobs[0].levels[0].label}"

@@ -67,7 +67,7 @@ def tables_of(study: Study) -> list[Table]:
     caption = (
         f"{sizes} Quality: means over held-out frames, all at the base's picture size. Seconds are processor "
         "seconds of all threads, of the run that made the result; training includes the views that were "
-        "made for it, the whole job everything but evaluate. Milliseconds: the baked avatar on one thread, "
+        "made for it, the whole job all up to training. Milliseconds: the baked avatar on one thread, "
         "the least of 15 frames, drawn at 512×512. In bold letters: on the frontier of PSNR and training "
         f"seconds.{chance}"
     )
@@ -96,7 +96,7 @@ def row(study: Study, entry: Entry, edge: set[int]) -> Row:
     if entry.outcome is None:
         return Row(label, {}, f"failed: {entry.reason}")
     values = {
-        "gaussians": float(entry.outcome.gaussians),
+        "gaussians": entry.gaussians,
         **{name: entry.get(name) for name in ("psnr", "psnr_interior", "ssim", "lpips_alex")},
         "train_s": entry.cost,
         "times": entry.cost / study.base.cost,

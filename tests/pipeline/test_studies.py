@@ -106,6 +106,8 @@ def test_words_of_a_study_are_the_command_lines_on_top_of_its_scale(toy):
         base_words("smile", {**words, "evaluate.turntable_frames": "9"})["evaluate.turntable_frames"] == "9"
     )
     assert base_words("ann", words_of(toy)) == words_of(toy)  # stages without such settings
+    assert "dataset" not in base_words("smile", {"dataset": "samples"})
+    assert base_words("smile", {"subject": "smile", "dataset": "samples"})["dataset"] == "samples"
     with pytest.raises(UserError, match="scale=huge"):
         base_words("smile", {"scale": "huge"})
 
