@@ -11,6 +11,7 @@ from stages.train.settings import TrainSettings
 
 # dB under the untrained avatar. Rates ten times too high lose 2 of a perfect start, a hundred times 7 to 19.
 WORSE = 3.0
+SEEN = 25.0  # dB from which on a difference is not a ruin: a made-up clip that starts at 37 dB may fall to 30
 WATCHED = 3  # training frames that are looked at where none is held out
 
 
@@ -25,7 +26,7 @@ def require_progress(untrained: float, now: float, iteration: int, settings: Tra
     Raises:
         UserError: it does.
     """
-    if now >= untrained - WORSE:
+    if now >= min(untrained - WORSE, SEEN):
         return
     rates = ", ".join(
         f"train.{name} (now {getattr(settings, name):g})"
