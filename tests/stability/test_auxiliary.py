@@ -9,9 +9,9 @@ import scipy.sparse as sparse
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.records import Split, read_cameras, write_split
+from pipeline.texture import robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary.texture.complete import membrane, neighbours
-from stages.auxiliary.texture.project import robust_mean, weighted_median
 from stages.auxiliary.texture.shade import shading
 from tests.stages.auxiliary_subject import FRAMES, context_for, write_clip
 
