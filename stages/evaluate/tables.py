@@ -59,7 +59,8 @@ class Table:
 
 def main_table(summary: Mapping[str, Any]) -> Table:
     """Every method on the metrics of the whole picture."""
-    means, metrics = summary["means"], summary["metrics"]
+    means, (psnr, *others) = summary["means"], summary["metrics"]
+    metrics = [psnr, "psnr_person", *others]
     body = [_row(summary, split, method, metrics) for split, method, _ in rows(means)]
     return Table([_heading(name) for name in metrics], body)
 
