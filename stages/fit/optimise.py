@@ -109,7 +109,8 @@ def gradients(
             if leaf.grad is not None:
                 whole = getattr(steps, name).grad
                 (whole[first:last] if name in PER_FRAME else whole).add_(leaf.grad)
-    require_finite_gradient(objective, {name: leaf.grad for name, leaf in steps.named().items()}, step)
+    slopes = {name: leaf.grad for name, leaf in steps.named().items() if leaf.grad is not None}
+    require_finite_gradient(objective, slopes, step)
     return total
 
 

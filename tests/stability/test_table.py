@@ -11,7 +11,7 @@ from tests.stability.properties import PROPERTIES
 
 TABLE = REPOSITORY / "docs" / "stability.md"
 TESTS = REPOSITORY / "tests"
-NAME = re.compile(r"`([\w/]+\.py)(?:::(\w+)(?:\[([^\]`]+)\])?)?`")
+NAME = re.compile(r"`((?:\w+/)*test_\w+\.py)(?:::(\w+)(?:\[([^\]`]+)\])?)?`")
 
 
 def rows() -> list[list[str]]:
