@@ -46,7 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
     shown = ", ".join(f"{name or 'doit'} {seconds:.1f}" for name, seconds in reference.seconds.items())
     print(f"faults: {len(reference.files)} files to compare; seconds of {shown}")
     print(f"faults: all kills will take about {reference.expected(kills) / 60:.0f} minutes", flush=True)
-    tally = Campaign(project, reference, kills, options.seed, keep / "differences").run()
+    seconds = 60 * options.minutes
+    tally = Campaign(project, reference, kills, options.seed, keep / "differences", seconds).run()
     print("\n".join(report(tally, options.seed, project.stages)))
     if options.json:
         content = {"seed": options.seed, "undisturbed_seconds": reference.seconds, **tally.as_json()}
@@ -62,6 +63,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of the moments, and of who is killed")
+    parser.add_argument("--minutes", type=float, default=1e7, help="no more kills after so many minutes")
     parser.add_argument("--quick", action="store_true", help="14 kills")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--assets", type=Path, default=REPOSITORY / "data" / "assets")

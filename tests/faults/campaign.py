@@ -122,15 +122,18 @@ def undisturbed(project: Project, keep: Path) -> Reference:
 class Campaign:
     """So many kills of one subject's runs."""
 
-    def __init__(self, project: Project, reference: Reference, kills: int, seed: int, keep: Path):
+    def __init__(
+        self, project: Project, reference: Reference, kills: int, seed: int, keep: Path, seconds: float = 1e9
+    ):
         self.project, self.reference, self.kills, self.keep = project, reference, kills, keep
+        self.limit = seconds
         self.plan, self.tally, self.draw = plan(project.stages, seed), Tally(), random.Random(seed)
 
     def run(self) -> Tally:
         """All kills and one run that is let through, then flipped bits."""
         start = time.monotonic()
         progress = Progress(self.kills, "faults")
-        while sum(self.tally.kills.values()) < self.kills:
+        while sum(self.tally.kills.values()) < self.kills and time.monotonic() - start < self.limit:
             kill = next(self.plan)
             if not kill.stage and self.tally.kills:  # all stages have had theirs: through with it
                 self.through(Run(self.project))
