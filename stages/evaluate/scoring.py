@@ -120,14 +120,16 @@ class Scorer:
         return self.picture(on(self.background), None if self.background == BLACK else on(BLACK))
 
     @torch.no_grad()
-    def values(self, picture: Picture, truth: Picture, interior: Tensor, person: Tensor) -> dict[str, float]:
+    def values(
+        self, picture: Picture, truth: Picture, interior: Tensor, person: Tensor | None = None
+    ) -> dict[str, float]:
         """Every metric of one picture.
 
         Args:
             picture: what is judged.
             truth: the person.
             interior: [H, W] bool, see :func:`pipeline.metrics.protocol.interior`.
-            person: [H, W] bool, the person's pixels.
+            person: [H, W] bool, the person's pixels; without ``psnr_person`` if None.
 
         Returns:
             Metric -> value; ``psnr_interior`` and ``psnr_person`` are NaN where there is no such pixel.
@@ -135,9 +137,10 @@ class Scorer:
         values = {
             "psnr": psnr(picture.image, truth.image),
             "psnr_interior": psnr(picture.black, truth.black, interior),
-            "psnr_person": psnr(picture.black, truth.black, person),
             "ssim": ssim(picture.image, truth.image, BACKGROUNDS[self.background]),
         }
+        if person is not None:
+            values["psnr_person"] = psnr(picture.black, truth.black, person)
         return {**values, **self._perceptual(picture, truth)}
 
     def crops(self, picture: Picture, boxes: Iterable[Box]) -> list[Picture]:
