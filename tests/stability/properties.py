@@ -49,6 +49,7 @@ def property_of(*strategies: st.SearchStrategy):
 
 def floats(low: float = -1e6, high: float = 1e6) -> st.SearchStrategy[float]:
     """Finite numbers, with 0, the ends and numbers near 0 more often."""
+    low, high = float(np.float32(low)), float(np.float32(high))
     special = [value for value in (0.0, low, high, 1e-30, 1e-7, -1e-7, 1.0) if low <= value <= high]
     return st.one_of(st.sampled_from(special), st.floats(low, high, width=32))
 

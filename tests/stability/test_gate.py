@@ -142,13 +142,13 @@ def test_a_body_outside_every_picture_is_refused(subject, tmp_path):
 
 def test_flicker_at_the_line_keeps_training_finite_and_weights_in_place(subject, tmp_path):
     """A hundred vertices cross the line at every look."""
-    settings = {"gate_from": 1.0, "iterations": 20, "subdivisions": 1, "subdivide_from": 0.3}
+    settings = {"gate_from": 1.0, "iterations": 12, "subdivisions": 1, "subdivide_from": 0.3}
     trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
     on = trainer.avatar.active.clone()
     off = on.clone()
     off[torch.nonzero(on)[::7][:100, 0]] = False
     sizes = set()
-    for step in range(12):
+    for step in range(8):
         trainer.avatar.gate(on if step % 2 else off)
         values = trainer.step()
         sizes.add(len(trainer.avatar))
@@ -158,14 +158,14 @@ def test_flicker_at_the_line_keeps_training_finite_and_weights_in_place(subject,
 
 
 def test_flickering_gate_gives_the_same_run_twice(subject, tmp_path):
-    settings = {"gate_from": 1.0, "iterations": 6}
+    settings = {"gate_from": 1.0, "iterations": 4}
     ends = []
     for name in ("one", "two"):
         trainer = trainer_for(context_for(subject, tmp_path / name, **settings))
         on = trainer.avatar.active.clone()
         off = on.clone()
         off[torch.nonzero(on)[::5][:200, 0]] = False
-        for step in range(6):
+        for step in range(4):
             trainer.avatar.gate(on if step % 2 else off)
             trainer.step()
         ends.append(torch.nn.utils.parameters_to_vector(trainer.avatar.parameters()))

@@ -24,7 +24,7 @@ def drawn(name, **limits):
 
 @pytest.mark.parametrize("name", PROPERTIES)
 def test_property(name):
-    drawn(name, max_examples=20, derandomize=True)()
+    drawn(name, max_examples=12, derandomize=True)()
 
 
 @pytest.mark.soak

@@ -66,11 +66,11 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
     place = spoilt(subject, tmp_path / "noise")
     noise = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     write_frame(place / "ingest" / "frames", 2, noise)
-    settings = {"iterations": 12, "face": 0.0}
+    settings = {"iterations": 8, "face": 0.0}
     trainer = trainer_for(context_for(place, tmp_path / "out", **settings))
     clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
-    steps(trainer, 12)
-    steps(clean, 12)
+    steps(trainer, 8)
+    steps(clean, 8)
     inputs = stage.read_inputs(context_for(subject, tmp_path / "unused"))
     scores = [one.held_out(inputs.whole, inputs.split.test) for one in (trainer, clean)]
     assert scores[0] > scores[1] - 6
@@ -218,7 +218,7 @@ def drift(subject, tmp_path, count, **settings):
 
 def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
     half, single = (
-        drift(subject, tmp_path / name, 12, half_precision=name == "half") for name in ("half", "single")
+        drift(subject, tmp_path / name, 6, half_precision=name == "half") for name in ("half", "single")
     )
     assert np.abs(half[0] - single[0]).max() < 0.05 * single[0][0]
     assert abs(half[1] - single[1]) < 0.5
@@ -241,7 +241,7 @@ def test_thousands_of_steps_on_one_frame(subject, tmp_path):
 def test_a_settled_run_stays_settled(subject, tmp_path):
     """Nothing is left to learn: Adam's second moments fade, and its steps must not blow up."""
     trainer = trainer_for(
-        context_for(subject, tmp_path / "out", iterations=40, final_rate=1.0, warm_up=1, face=0.0)
+        context_for(subject, tmp_path / "out", iterations=24, final_rate=1.0, warm_up=1, face=0.0)
     )
-    taken = steps(trainer, 40)
-    assert max(taken[20:]) < 1.5 * max(taken[:10])
+    taken = steps(trainer, 24)
+    assert max(taken[12:]) < 1.5 * max(taken[:10])
