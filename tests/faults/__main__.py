@@ -47,7 +47,12 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"faults: {len(reference.files)} files to compare; seconds of {shown}")
     print(f"faults: all kills will take about {reference.expected(kills) / 60:.0f} minutes", flush=True)
     seconds = 60 * options.minutes
-    tally = Campaign(project, reference, kills, options.seed, keep / "differences", seconds).run()
+    campaign = Campaign(project, reference, kills, options.seed, keep / "differences", seconds)
+    try:
+        tally = campaign.run()
+    except (KeyboardInterrupt, SystemExit):
+        tally = campaign.stopped()
+        print("faults: stopped before its end; so far:")
     print("\n".join(report(tally, options.seed, project.stages)))
     if options.json:
         content = {"seed": options.seed, "undisturbed_seconds": reference.seconds, **tally.as_json()}

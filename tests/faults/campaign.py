@@ -17,7 +17,7 @@ from tests.faults.observe import differences, litter, phase, published, wrongs
 from tests.faults.project import Project
 from tests.faults.runs import MOMENTS, TARGETS, Kill, Run
 
-A_STAGE = 3  # kills of each stage, and of doit's start, before a run is let through
+A_STAGE = 4  # kills of each stage, and of doit's start, before a run is let through
 PATIENCE = 10.0  # seconds for a stage to end after doit was killed
 SHARES = (0.8, 0.1, 0.1)  # of the targets
 IN_PUBLISHING = 0.3  # of the kills that wait for a step of publishing
@@ -126,24 +126,29 @@ class Campaign:
         self, project: Project, reference: Reference, kills: int, seed: int, keep: Path, seconds: float = 1e9
     ):
         self.project, self.reference, self.kills, self.keep = project, reference, kills, keep
-        self.limit = seconds
+        self.limit, self.start = seconds, time.monotonic()
         self.plan, self.tally, self.draw = plan(project.stages, seed), Tally(), random.Random(seed)
 
     def run(self) -> Tally:
         """All kills and one run that is let through, then flipped bits."""
-        start = time.monotonic()
+        self.start, before = time.monotonic(), ""
         progress = Progress(self.kills, "faults")
-        while sum(self.tally.kills.values()) < self.kills and time.monotonic() - start < self.limit:
+        while sum(self.tally.kills.values()) < self.kills and time.monotonic() - self.start < self.limit:
             kill = next(self.plan)
-            if not kill.stage and self.tally.kills:  # all stages have had theirs: through with it
+            if before and not kill.stage:  # all stages have had theirs: through with it
                 self.through(Run(self.project))
+            before = kill.stage
             if self.strike(kill):
                 note = f"{self.tally.runs} whole runs compared, {len(self.tally.failures)} failures"
                 progress.advance(1, note)
         self.through(Run(self.project))
         progress.close()
         self.flips()
-        self.tally.seconds = time.monotonic() - start
+        return self.stopped()
+
+    def stopped(self) -> Tally:
+        """What is known now."""
+        self.tally.seconds = time.monotonic() - self.start
         return self.tally
 
     def strike(self, kill: Kill) -> bool:
