@@ -22,7 +22,7 @@ from stages.evaluate.scoring import AVATAR, BASELINES, CEILING, HELD_OUT, MESH, 
 
 LEVEL = 1.0  # dB within which an interval about zero means that there is no difference
 CLEAR = 1.0  # dB under which a cause is not worth naming
-NEAR_CEILING = 1.5  # dB between avatar and ceiling, under which masks are what is measured
+NEAR_CEILING = 2.0  # dB between avatar and ceiling, under which masks are what is measured
 PARTS = 3.0  # dB by which a part must be worse than the whole person to be named
 NAMED = 2  # causes
 
