@@ -107,8 +107,8 @@ def total_time(outcomes: Iterable[Outcome]) -> str:
             processor[folder] = one.cpu_seconds.get(stage, 0.0)
     cpu = sum(value for value in processor.values() if math.isfinite(value))
     return (
-        f"The {len(wall)} results that this stands on took {sum(wall.values()) / 60:,.0f} wall-clock minutes, "
-        f"{cpu / 60:,.0f} minutes of processor time."
+        f"The {len(wall)} results that this stands on took {sum(wall.values()) / 60:,.0f} wall-clock "
+        f"minutes, {cpu / 60:,.0f} minutes of processor time."
     )
 
 
@@ -121,9 +121,9 @@ def timings_section(outcomes: Mapping[str, Outcome], seconds: float, versions: M
     return Section(
         "Time and versions",
         [
-            f"{total_time(outcomes.values())} This call took {seconds:,.0f} s: what the store held was not made "
-            "again. Wall-clock seconds of each stage are those of the run that made its result, whatever else "
-            "the machine was doing then."
+            f"{total_time(outcomes.values())} This call took {seconds:,.0f} s: what the store held was not "
+            "made again. Wall-clock seconds of each stage are those of the run that made its result, whatever "
+            "else the machine was doing then."
         ],
         details=[("wall-clock seconds of each variant's stages", rows), ("versions", list(versions.items()))],
     )
