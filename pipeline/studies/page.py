@@ -122,8 +122,8 @@ def timings_section(outcomes: Mapping[str, Outcome], seconds: float, versions: M
         "Time and versions",
         [
             f"{total_time(outcomes.values())} This call took {seconds:,.0f} s: what the store held was not "
-            "made again. Wall-clock seconds of each stage are those of the run that made its result, whatever "
-            "else the machine was doing then."
+            "made again. Wall-clock seconds of each stage are those of the run that made its result, "
+            "whatever else the machine was doing then."
         ],
         details=[("wall-clock seconds of each variant's stages", rows), ("versions", list(versions.items()))],
     )
