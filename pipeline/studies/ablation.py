@@ -58,12 +58,14 @@ RUNTIME = (
     Column("total_ms", "total ms", 1, "lower"),
     Column("fps", "frames/s", 1, "higher"),
 )
+EVEN = tuple(dataclasses.replace(column, better="") for column in IMAGE)  # neither row is the better one
 REGIONS = tuple(
     dataclasses.replace(column, key=f"{column.key}_{region}", label=f"{region} {column.label}")
     for region in ("face", "hands")
     for column in IMAGE
 )
-SAME = "the very same avatar as full: this scene does not call for it"
+COLUMNS = {"runtime": RUNTIME, "regions": REGIONS, "chance": EVEN}
+SAME = "the very same avatar as full: here it changes nothing"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,8 +213,12 @@ def tables_of(results: Results, sizes: str) -> list[Table]:
     chance = {
         "name": "chance",
         "title": "What chance is worth: the whole method with another seed",
+        "kind": "chance",
         "rows": [{"variant": FULL}, {"variant": CHANCE}],
     }
+    psnr = [[results.value(one, which, "psnr") for which in (CHANCE, FULL)] for one in results.subjects]
+    gap = _mean([abs(other - full) for other, full in psnr])
+    sizes += f" Another seed differs by {gap:.2f} dB." if math.isfinite(gap) else ""
     return [table for table in (*tables, _table(chance, results, sizes)) if not _empty(table)]
 
 
@@ -223,7 +229,7 @@ def _empty(table: Table) -> bool:
 
 
 def _table(about: Mapping[str, Any], results: Results, sizes: str) -> Table:
-    columns = {"runtime": RUNTIME, "regions": REGIONS}.get(about.get("kind", ""), IMAGE)
+    columns = COLUMNS.get(about.get("kind", ""), IMAGE)
     same = results.dataset and results.dataset == about.get("dataset")
     if same and "subject" in about:
         same = results.subjects == (about["subject"],)
@@ -335,6 +341,7 @@ def parquet_values(tables: Sequence[Table], results: Results) -> list[Value]:
 def publish(folder: Path, name: str, results: Results, words: Mapping[str, str], seconds: float) -> None:
     """Writes the tables, the plot and the page, and says where they are."""
     from pipeline.studies.ablation_report import write_ablation
+    from pipeline.studies.page import total_time
     from pipeline.studies.tables import latex, markdown, write_values
 
     first = next(one for one in results.endings.values() if isinstance(one, Outcome))
@@ -345,4 +352,5 @@ def publish(folder: Path, name: str, results: Results, words: Mapping[str, str],
     write_values(folder / "table.parquet", parquet_values(tables, results))
     write_ablation(folder, name, results, tables, versions_of(first), seconds, words)
     print("\n".join(markdown(table) for table in tables))
-    print(f"{seconds:.0f} s; tables, plot and page: {shown(folder)}")
+    made = [one for one in results.endings.values() if isinstance(one, Outcome)]
+    print(f"{total_time(made)} This call: {seconds:.0f} s; tables, plots and page: {shown(folder)}")

@@ -26,12 +26,12 @@ def write_ablation(
     worth, noise = differences(results), chance(results)
     pictures = []
     for metric, label, file in (
-        ("psnr", "PSNR against the whole method, dB", "worth_psnr.png"),
-        ("lpips_alex", "LPIPS×100 against the whole method (less is better)", "worth_lpips.png"),
+        ("psnr", "PSNR against full, dB", "worth_psnr.png"),
+        ("lpips_alex", "LPIPS×100 against full, less is better", "worth_lpips.png"),
     ):
         factor = 1 if metric == "psnr" else 100
         values = {label_of(key): factor * worth(key, metric) for key in VARIANTS if key != FULL}
-        bars(folder / file, values, label, factor * noise(metric))
+        bars(folder / file, values, label, factor * noise(metric), higher_is_better=metric == "psnr")
         pictures.append(Picture(folder / file, f"{label}; grey: by how much another seed differs."))
     subject = next(one.subject for one in results.endings.values() if isinstance(one, Outcome))
     own = full_words(subject, words)

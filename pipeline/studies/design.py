@@ -183,8 +183,15 @@ def next_single(
     missing = [point for point in singles(knobs) if point not in known.made]
     # In an order that does not hang on what happens to be stored, so that a resumed study keeps to it.
     missing.sort(key=lambda point: (max(point), known.seconds(point, (TRAIN,))))
-    affordable = (point for point in missing if slowness * known.seconds(point, needed(point)) <= left)
-    return next(affordable, None)
+    return next((point for point in missing if affordable(known, point, needed, left, slowness)), None)
+
+
+def affordable(
+    known: Design, point: Point, needed: Callable[[Point], Sequence[str]], left: float, slowness: float
+) -> bool:
+    """Whether a point is in the store, or is expected to be made within what is left."""
+    stages = needed(point)
+    return not stages or slowness * known.seconds(point, stages) <= left
 
 
 def next_combination(
@@ -208,6 +215,6 @@ def next_combination(
         if promise < LEAST_AREA:
             continue
         value = promise / max(known.seconds(point, (TRAIN,)), 1.0)
-        if value > most and slowness * known.seconds(point, needed(point)) <= left:
+        if value > most and affordable(known, point, needed, left, slowness):
             best, most = point, value
     return best

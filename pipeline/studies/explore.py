@@ -184,7 +184,9 @@ class Explorer:
         base = self.endings.get(base_of(self.knobs))
         each = base.seconds.get("fit", 0.0) if isinstance(base, Outcome) else 0.0
         for steps in fit_steps(own_steps):
-            if self.spent + self.slowness * each * steps / own_steps > self.budget / 4 and self.fits:
+            stored = job_from_words(self.subject, {**self.own, "fit.iterations": str(steps)}).find("fit")
+            expected = self.slowness * each * steps / own_steps
+            if not stored and self.fits and self.spent + expected > self.budget / 4:
                 self.say(f"fit of {steps} steps is left out: the budget")
                 continue
             try:

@@ -9,7 +9,7 @@ from pipeline.job import job_from_words
 from pipeline.metrics import Lpips
 from pipeline.studies.clip import Clip
 from pipeline.studies.notes import Notes
-from pipeline.studies.run import OWN_WORDS
+from pipeline.studies.run import stage_words
 from pipeline.study import Outcome
 from pipeline.workspace import Workspace
 
@@ -21,8 +21,8 @@ def notes_of(workspace: Workspace, subject: str) -> Notes:
 
 def clip_of(base: Outcome, words: Mapping[str, str], workspace: Workspace) -> Clip:
     """The clip of the base, on the background that evaluate composites on."""
-    own = {name: value for name, value in words.items() if name not in OWN_WORDS}
-    background = getattr(job_from_words(base.subject, own).settings["evaluate"], "background", "black")
+    own = job_from_words(base.subject, stage_words(words))
+    background = getattr(own.settings["evaluate"], "background", "black")
     return Clip(
         ingest=base.folders["ingest"],
         body_file=workspace.body_file,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -96,6 +97,21 @@ def settings_section(
     return Section("Settings", details=details)
 
 
+def total_time(outcomes: Iterable[Outcome]) -> str:
+    """A sentence on what everything that the outcomes stand on took, each result counted once."""
+    wall: dict[Path, float] = {}
+    processor: dict[Path, float] = {}
+    for one in outcomes:
+        for stage, folder in one.folders.items():
+            wall[folder] = one.seconds.get(stage, 0.0)
+            processor[folder] = one.cpu_seconds.get(stage, 0.0)
+    cpu = sum(value for value in processor.values() if math.isfinite(value))
+    return (
+        f"The {len(wall)} results that this stands on took {sum(wall.values()) / 60:,.0f} wall-clock "
+        f"minutes, {cpu / 60:,.0f} minutes of processor time."
+    )
+
+
 def timings_section(outcomes: Mapping[str, Outcome], seconds: float, versions: Mapping[str, str]) -> Section:
     """What each run's stages took, the study's own time, and the versions."""
     rows = []
@@ -105,8 +121,9 @@ def timings_section(outcomes: Mapping[str, Outcome], seconds: float, versions: M
     return Section(
         "Time and versions",
         [
-            f"This call took {seconds:,.0f} s; what the store held was not made again. Wall-clock seconds of "
-            "each stage are those of the run that made its result, whatever else the machine was doing then."
+            f"{total_time(outcomes.values())} This call took {seconds:,.0f} s: what the store held was not "
+            "made again. Wall-clock seconds of each stage are those of the run that made its result, "
+            "whatever else the machine was doing then."
         ],
         details=[("wall-clock seconds of each variant's stages", rows), ("versions", list(versions.items()))],
     )

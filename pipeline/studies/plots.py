@@ -195,26 +195,33 @@ def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], acros
     _save(figure, path)
 
 
-def bars(path: Path, values: Mapping[str, float], label: str, noise: float = math.nan) -> None:
-    """Horizontal bars around zero, what lies within chance shaded.
+def bars(
+    path: Path,
+    values: Mapping[str, float],
+    label: str,
+    noise: float = math.nan,
+    higher_is_better: bool = True,
+) -> None:
+    """Horizontal bars around zero, what lies within chance shaded; losses in another colour than gains.
 
     Args:
         path: the PNG.
         values: name -> value, top down; those that are not finite are left out.
         label: of the axis.
         noise: how large a value must be to mean anything; NaN where that is not known.
+        higher_is_better: whether a value above zero is a gain.
     """
     known = {name: value for name, value in values.items() if math.isfinite(value)}
     figure, axes = _figure(Axis(label), Axis(""), (SIZE[0], 0.9 + 0.36 * max(3, len(known))))
     names = list(known)[::-1]
-    colors = [ORANGE if known[name] < 0 else BLUE for name in names]
+    colors = [ORANGE if (known[name] < 0) == higher_is_better else BLUE for name in names]
     axes.barh(range(len(names)), [known[name] for name in names], color=colors, height=0.62, zorder=3)
     axes.set_yticks(range(len(names)), names, fontsize=8.5)
     axes.axvline(0, color=INK, linewidth=0.8, zorder=4)
     if math.isfinite(noise):
         axes.axvspan(-abs(noise), abs(noise), color=GREY, alpha=0.3, zorder=1)
     for place, name in enumerate(names):
-        text = f"{known[name]:+.2f}"
+        text = f"{round(known[name], 2) + 0.0:+.2f}"
         side = "left" if known[name] >= 0 else "right"
         axes.annotate(
             text,

@@ -14,7 +14,15 @@ from pipeline.job import shown
 from pipeline.studies.explore import spoken
 from pipeline.studies.fits import FitPoint
 from pipeline.studies.frontier import frontier
-from pipeline.studies.page import Page, Picture, Section, settings_section, timings_section, write_page
+from pipeline.studies.page import (
+    Page,
+    Picture,
+    Section,
+    settings_section,
+    timings_section,
+    total_time,
+    write_page,
+)
 from pipeline.studies.plots import Axis, Dot, curves, scatter
 from pipeline.studies.sizes import sizes_of, versions_of
 from pipeline.studies.tables import HERE, Column, Row, Table, latex, markdown, values_of, write_values
@@ -55,7 +63,8 @@ def publish(folder: Path, study: Study) -> None:
     write_page(folder / "report.html", page(study, tables, pictures))
     print("\n".join(map(markdown, tables)))
     print(sentence(study))
-    print(f"{spoken(study.seconds)} of {spoken(study.budget)}; table, plots and page: {shown(folder)}")
+    made = [entry.outcome for entry in study.entries if entry.outcome]
+    print(f"{total_time(made)} This call: {spoken(study.seconds)} of {spoken(study.budget)}; {shown(folder)}")
 
 
 def tables_of(study: Study) -> list[Table]:

@@ -190,6 +190,15 @@ def test_failed_points_are_not_tried_again_and_lead_nowhere():
     assert all(point[1] == 0 for point in points if point != (0, 1, 0, 0))
 
 
+def test_what_the_store_holds_is_taken_up_when_the_budget_is_spent():
+    world = World(((1, 0.5, 2), (1, 1.5), (1, 0.9), (1, 1)), ((0, -1, 1), (0, 1), (0, -0.5), (0, 0.1)))
+    world.make((0, 0, 0, 0))
+    world.stored |= {(1, 0, 0, 0), (1, 1, 0, 0)}
+    for choose, point in ((next_single, (1, 0, 0, 0)), (next_combination, None)):
+        assert choose(KNOBS, world.made, world.needed, -5.0) == point
+    assert next_single(KNOBS, world.made, lambda point: ("train",), -5.0) is None
+
+
 def test_words_and_labels_of_a_point():
     assert words_of(KNOBS, (2, 1, 0, 0)) == {"a": "200", "b": "large"}
     assert label_of(KNOBS, (2, 1, 0, 0)) == "200, large" and label_of(KNOBS, base_of(KNOBS)) == "base"
