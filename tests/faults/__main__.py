@@ -27,7 +27,7 @@ from tests.faults.campaign import (
     undisturbed,
 )  # fmt: skip
 from tests.faults.observe import PHASES, SHOWS_TIMES
-from tests.faults.project import real_project
+from tests.faults.project import real_project, toy_project
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,8 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that its run is stopped too
     kills = 14 if options.quick else options.kills
     keep = Path(tempfile.mkdtemp(prefix="flexiavatar-faults-"))
-    project = real_project(keep / "project", options.assets.resolve())
-    print(f"faults: {kills} kills, seed {options.seed}; first two undisturbed runs, about two minutes")
+    root = keep / "project"
+    project = toy_project(root) if options.toy else real_project(root, options.assets.resolve())
+    print(f"faults: {kills} kills, seed {options.seed}; first two undisturbed runs, minutes")
     sys.stdout.flush()
     reference = undisturbed(project, keep / "reference")
     shown = ", ".join(f"{name or 'doit'} {seconds:.1f}" for name, seconds in reference.seconds.items())
@@ -70,6 +71,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the moments, and of who is killed")
     parser.add_argument("--minutes", type=float, default=1e7, help="no more kills after so many minutes")
     parser.add_argument("--quick", action="store_true", help="14 kills")
+    parser.add_argument("--toy", action="store_true", help="stages that only count: in minutes")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--assets", type=Path, default=REPOSITORY / "data" / "assets")
     return parser.parse_args(arguments)

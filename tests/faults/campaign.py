@@ -164,8 +164,8 @@ class Campaign:
         self.note(run)
         where = phase(self.project, run.stage) if run.stage else "starting"
         self.tally.kills[run.stage or "doit", where] += 1
-        self.tally.targets[kill.target] += 1
-        if kill.target == "stage" and "killed by signal 9" not in run.text():
+        self.tally.targets[run.killed] += 1
+        if run.killed == "stage" and "killed by signal 9" not in run.text():
             self.fail(MANUAL, f"doit does not say who was killed by {kill}", run)
         for wrong in wrongs(self.project):
             self.fail(CORRUPT, f"{wrong}, after {kill} ({where})", run)

@@ -80,6 +80,15 @@ class Project:
         return {**os.environ, **threads, "PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"}
 
 
+def toy_project(root: Path) -> Project:
+    """Stages that only count, a second each: for many kills in little time."""
+    from tests.pipeline.conftest import ToyProject
+
+    toy = ToyProject(root)
+    words = ("subject=ann", "paint.iterations=8", "paint.rate=0.02", *toy.words())
+    return Project(words, "ann", ("gather", "bend", "paint"), toy.store)
+
+
 def real_project(root: Path, assets: Path) -> Project:
     """The tiny subject; the definitions that it shares with the checkout are links."""
     data = root / "data"

@@ -49,6 +49,7 @@ class Run:
     def __init__(self, project: Project, *tasks: str):
         self.project = project
         self.lines: list[str] = []
+        self.killed = ""  # who was, in the end
         self.began: dict[str, float] = {}
         self.start = time.monotonic()
         self.process = subprocess.Popen(
@@ -121,12 +122,15 @@ class Run:
         if self.over:
             return False
         victims = children(self.process.pid) if target == "stage" else [self.process.pid]
+        if not victims:  # between two stages there is none to kill
+            target = "group"
         with contextlib.suppress(ProcessLookupError):
             if target == "group":
                 os.killpg(self.process.pid, signal.SIGKILL)
             for victim in victims if target != "group" else ():
                 os.kill(victim, signal.SIGKILL)
-        return target != "stage" or bool(victims)
+        self.killed = target
+        return True
 
     def gone(self, seconds: float) -> bool:
         """Whether nothing of the session is left within so many seconds."""

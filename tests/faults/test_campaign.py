@@ -8,19 +8,12 @@ import pytest
 from tests.faults.__main__ import headline, report
 from tests.faults.campaign import CORRUPT, DIFFERENT, MANUAL, Campaign, Tally, plan, undisturbed
 from tests.faults.observe import differences, litter, published, wrongs
-from tests.faults.project import Project
+from tests.faults.project import Project, toy_project
 from tests.faults.runs import MOMENTS, TARGETS, Run
-from tests.pipeline.conftest import ToyProject
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="it watches processes as Linux shows them")
 STAGES = ("gather", "bend", "paint")
 SEED = 3
-
-
-def toy_project(root):
-    toy = ToyProject(root)
-    words = ("subject=ann", "paint.iterations=8", "paint.rate=0.02", *toy.words())
-    return Project(words, "ann", STAGES, toy.store)
 
 
 def test_killed_at_random_moments_and_then_the_same_command(tmp_path):
