@@ -34,6 +34,7 @@ METRICS = {"psnr": 1, "psnr_interior": 1, "ssim": 100, "lpips_alex": 100, "psnr_
 """What is compared, and the factor that tables show it with."""
 
 WHOLE, NOISE, RESIDUALS = "whole", "another seed", "residual colours"
+NEAREST = "nearest frame"  # no avatar at all: the training frame that is most like the held-out one
 HELD_OUT = 8  # frames that are scored
 CROP_HEIGHT = 160  # pixels of a picture of face or hand
 
@@ -78,7 +79,13 @@ ADDED: Mapping[str, Mapping[str, str]] = {
 }
 """The paper's regularisers that the quick preset leaves out: added, a variant each."""
 
-VARIANTS: Mapping[str, Mapping[str, str]] = {WHOLE: {}, NOISE: {"train.seed": "1"}, **PARTS, **ADDED}
+VARIANTS: Mapping[str, Mapping[str, str]] = {
+    WHOLE: {},
+    NOISE: {"train.seed": "1"},
+    NEAREST: {},
+    **PARTS,
+    **ADDED,
+}
 QUICK = (WHOLE, NOISE, "pose heads", "LPIPS")
 
 Numbers = dict[str, float]
@@ -86,18 +93,26 @@ Table = dict[str, dict[str, Numbers]]
 """Variant -> subject -> metric, or ``seconds`` -> value."""
 
 
-def numbers_of(subject: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
+def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
     """Trains one variant on one subject and scores it."""
     job = job_from_words(subject, words)
     folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
-    done = trained(job)
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
-    scores = clip.scores(done.avatar, Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")}))
-    hands = [scores[name] for name in ("psnr_left_hand", "psnr_right_hand") if name in scores]
-    scores["psnr_hands"] = statistics.fmean(hands) if hands else math.nan
+    scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})
+    if variant == NEAREST:
+        return with_hands(clip.nearest_scores(scorer)) | {"seconds": 0.0}
+    done = trained(job)
+    scores = with_hands(clip.scores(done.avatar, scorer))
     if pictures is not None:
         write_crops(pictures, clip, done.avatar)
-    return {name: scores.get(name, math.nan) for name in METRICS} | {"seconds": done.seconds}
+    return scores | {"seconds": done.seconds}
+
+
+def with_hands(scores: Mapping[str, float]) -> Numbers:
+    """The metrics that are compared, both hands as one."""
+    hands = [scores[name] for name in ("psnr_left_hand", "psnr_right_hand") if name in scores]
+    both = {**scores, "psnr_hands": statistics.fmean(hands) if hands else math.nan}
+    return {name: both.get(name, math.nan) for name in METRICS}
 
 
 def write_crops(path: Path, clip: Clip, avatar) -> None:
@@ -126,6 +141,8 @@ def gains(variant: str, table: Table, metric: str, subjects: Iterable[str]) -> N
 
 def costs(variant: str, table: Table, subjects: Iterable[str]) -> Numbers:
     """How much longer training takes with a part than without it, as a share."""
+    if variant == NEAREST:
+        return {}
     pair = (variant, WHOLE) if variant in ADDED else (WHOLE, variant)
     seconds = [{one: table[name][one]["seconds"] for one in table[name]} for name in pair]
     return {one: seconds[0][one] / seconds[1][one] - 1 for one in subjects if one in table[variant]}
@@ -149,10 +166,10 @@ def main(arguments: list[str] | None = None) -> None:
             if subject not in done:
                 wanted = options.pictures and variant in (WHOLE, RESIDUALS)
                 picture = options.pictures / f"{subject}_{variant}.png" if wanted else None
-                done[subject] = numbers_of(subject, {**words, **VARIANTS[variant]}, picture)
+                done[subject] = numbers_of(subject, variant, {**words, **VARIANTS[variant]}, picture)
                 _write(options.json, table)
         print(_line(variant, table[variant]), flush=True)
-    shown = [name for name in table if name != WHOLE and set(subjects) & set(table[name])]
+    shown = [name for name in VARIANTS if name in table and name != WHOLE and set(subjects) & set(table[name])]
     print(_markdown(shown, table, subjects))
     print(_headline(shown, table, subjects))
 
@@ -208,6 +225,7 @@ def _headline(variants: Sequence[str], table: Table, subjects: Sequence[str]) ->
     """What earns most, and what earns no more anywhere than another seed does."""
     psnr = {name: gains(name, table, "psnr", subjects) for name in variants}
     noise = max((abs(value) for value in psnr.pop(NOISE, {}).values()), default=math.nan)
+    psnr.pop(NEAREST, None)
     best = max(psnr, key=lambda name: _mean(psnr[name]))
     idle = [name for name, each in psnr.items() if max(each.values()) <= noise]
     return (

@@ -26,6 +26,7 @@ from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Rendering, render
 from pipeline.stage import Context
 from pipeline.study import made
+from stages.evaluate.baselines import nearest_frames
 from stages.evaluate.scoring import Scorer
 from stages.train import run as train
 
@@ -124,13 +125,26 @@ class Clip:
         gaussians = avatar.gaussians(*self.pose(frame), self.seconds.get(frame))
         return render(gaussians, self.cameras[frame])
 
+    def person(self, frame: int) -> Tensor:
+        """What was filmed, the person on black: [H, W, 3]."""
+        return composite(read_frame(self.ingest / "frames", frame), read_mask(self.ingest / "masks", frame))
+
     def scores(self, avatar: Avatar, scorer: Scorer) -> dict[str, float]:
         """Each metric's mean over the held-out frames, the person on black."""
+        return self.scores_of(lambda frame: self.render(avatar, frame).color.clamp(0, 1), scorer)
+
+    def nearest_scores(self, scorer: Scorer) -> dict[str, float]:
+        """The same of the training frame that is most like each held-out one."""
+        training = read_split(self.ingest / "split.json").train
+        nearest = nearest_frames(self.person, training, self.test)
+        return self.scores_of(lambda frame: self.person(nearest[frame]), scorer)
+
+    def scores_of(self, shown_at: Callable[[int], Tensor], scorer: Scorer) -> dict[str, float]:
+        """Each metric's mean over the held-out frames of what is shown at each, [H, W, 3] on black."""
         total: dict[str, list[float]] = {}
         for frame in self.test:
             mask = read_mask(self.ingest / "masks", frame)
-            truth = scorer.picture(composite(read_frame(self.ingest / "frames", frame), mask))
-            shown = scorer.picture(self.render(avatar, frame).color.clamp(0, 1))
+            truth, shown = scorer.picture(self.person(frame)), scorer.picture(shown_at(frame))
             for name, value in scorer.values(shown, truth, interior(mask)).items():
                 total.setdefault(name, []).append(value)
             for name, box in self.crops(frame).items():
