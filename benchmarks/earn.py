@@ -169,7 +169,9 @@ def main(arguments: list[str] | None = None) -> None:
                 done[subject] = numbers_of(subject, variant, {**words, **VARIANTS[variant]}, picture)
                 _write(options.json, table)
         print(_line(variant, table[variant]), flush=True)
-    shown = [name for name in VARIANTS if name in table and name != WHOLE and set(subjects) & set(table[name])]
+    shown = [
+        name for name in VARIANTS if name in table and name != WHOLE and set(subjects) & set(table[name])
+    ]
     print(_markdown(shown, table, subjects))
     print(_headline(shown, table, subjects))
 
