@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pipeline.guard import require_finite
-from pipeline.metrics.image import psnr, ssim
+from pipeline.metrics.image import PSNR_CAP, psnr, ssim
 from pipeline.metrics.intervals import Interval, interval
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.protocol import BACKGROUNDS, BLACK
@@ -231,9 +231,11 @@ def intervals(scores: Iterable[Score], settings: EvaluateSettings) -> Intervals:
     scores = [one for one in scores if one.split != VIEWS]
     result: Intervals = {}
     for split, method, metric in dict.fromkeys((one.split, one.method, one.metric) for one in scores):
-        found = _interval([value for _, value in values_of(scores, split, method, metric)], settings)
+        # Training frames are spread over the clip: none of those that are scored is the next of another.
+        block = 1 if split == TRAINING else None
+        found = _interval([value for _, value in values_of(scores, split, method, metric)], settings, block)
         if found is not None:
-            ends = [round(found.low, 6), round(found.high, 6)]
+            ends = [round(value, 6) for value in np.clip([found.low, found.high], *bounds(metric)).tolist()]
             result.setdefault(split, {}).setdefault(method, {})[metric] = ends
     return result
 
@@ -261,9 +263,18 @@ def differences(
     return result
 
 
-def _interval(values: list[float], settings: EvaluateSettings) -> Interval | None:
+def bounds(metric: str) -> tuple[float, float]:
+    """The least and the largest value that a metric can have, which a stretched interval knows nothing of."""
+    if metric in ("identity_found", "unseen_share"):
+        return 0.0, 1.0
+    if metric.startswith(("ssim", "identity_cosine")):
+        return -1.0, 1.0
+    return (-math.inf, PSNR_CAP) if metric.startswith("psnr") else (0.0, math.inf)
+
+
+def _interval(values: list[float], settings: EvaluateSettings, block: int | None = None) -> Interval | None:
     rounds, seed = settings.bootstrap_rounds, settings.bootstrap_seed
-    return interval(np.array(values, np.float64), rounds, seed, settings.confidence)
+    return interval(np.array(values, np.float64), rounds, seed, settings.confidence, block)
 
 
 def _rounded(value: float | None) -> float | None:

@@ -17,7 +17,7 @@ from pipeline.records import read_cameras, write_cameras
 from stages.evaluate.assessment import Extras
 from stages.evaluate.evidence import read_evidence
 from stages.evaluate.mesh import nearest_known
-from stages.evaluate.scoring import Score, differences, intervals, table
+from stages.evaluate.scoring import Score, bounds, differences, intervals, table
 from stages.evaluate.second_mask import SecondMasks, edge, estimated, second_masks
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.tables import camera_table
@@ -235,6 +235,9 @@ def test_differences_are_taken_frame_by_frame():
     assert over["nearest_frame"]["psnr"]["mean"] == pytest.approx(2.0)
     assert over["nearest_frame"]["psnr"]["low"] < 1 < 3 < over["nearest_frame"]["psnr"]["high"]
     assert over["second_mask"]["psnr"] == {"mean": 1.0, "low": 1.0, "high": 1.0}
+    wild = [Score(frame, "test", "avatar", "ssim", value) for frame, value in enumerate((0.5, 0.9, 0.98))]
+    assert intervals(wild, settings)["test"]["avatar"]["ssim"][1] == 1.0  # and no more
+    assert bounds("lpips_alex_face")[0] == bounds("flicker")[0] == 0
     low, high = intervals(scores, settings)["test"]["avatar"]["psnr"]
     assert low < table(scores, ["psnr"])["test"]["avatar"]["psnr"] < high
 
