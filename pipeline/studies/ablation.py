@@ -209,6 +209,9 @@ def tables_of(results: Results, sizes: str) -> list[Table]:
         sizes: a sentence on the sizes, for the captions.
     """
     described = read_toml(Path(__file__).with_name("paper.toml"))["tables"]
+    psnr = [[results.value(one, which, "psnr") for which in (CHANCE, FULL)] for one in results.subjects]
+    gap = _mean([abs(other - full) for other, full in psnr])
+    sizes += f" Another seed differs by {gap:.2f} dB." if math.isfinite(gap) else ""
     tables = [_table(one, results, sizes) for one in described]
     chance = {
         "name": "chance",
@@ -216,9 +219,6 @@ def tables_of(results: Results, sizes: str) -> list[Table]:
         "kind": "chance",
         "rows": [{"variant": FULL}, {"variant": CHANCE}],
     }
-    psnr = [[results.value(one, which, "psnr") for which in (CHANCE, FULL)] for one in results.subjects]
-    gap = _mean([abs(other - full) for other, full in psnr])
-    sizes += f" Another seed differs by {gap:.2f} dB." if math.isfinite(gap) else ""
     return [table for table in (*tables, _table(chance, results, sizes)) if not _empty(table)]
 
 

@@ -280,9 +280,10 @@ def sentence(study: Study) -> str:
         return "The budget reached no setting but the study's own: give it more time."
     gaining = [one for one in known if one[1] > least]
     if not gaining:
+        chance = f"more than another seed does ({least:.1f} dB)" if math.isfinite(noise) else "anything"
         return (
-            f"No single change gains more than another seed does ({least:.1f} dB): stay with "
-            f"{told_size(study, base)}, or take what is cheaper."
+            f"No single change that was tried gains {chance}: stay with {told_size(study, base)}, "
+            "or take what is cheaper."
         )
     worth = max(gaining, key=lambda one: one[1] / max(math.log(max(one[2], 1.02)), 1e-3))
     most = max(gaining, key=lambda one: one[1])
