@@ -169,8 +169,11 @@ def key_of(description: Mapping[str, Any]) -> str:
 
 
 def wanted_keys(job: Job) -> dict[str, str]:
-    """The key that each stage's result has under the present settings, where its inputs are in the store."""
-    keys = {}
+    """The key that each stage's result has under the present settings, where its inputs are in the store.
+
+    Whole inputs, that is: a damaged manifest would lead to another key.
+    """
+    keys, job = {}, dataclasses.replace(job, thorough=True)
     for name in job.stages:
         with contextlib.suppress(UserError):
             keys[name] = key_of(job.description(name))

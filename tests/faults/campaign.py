@@ -54,7 +54,7 @@ class Tally:
         return sum(failure.startswith(kind) for failure in self.failures)
 
     def as_json(self) -> dict[str, Any]:
-        plain = dataclasses.asdict(self)
+        plain = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         plain["kills"] = {f"{stage} {where}": count for (stage, where), count in self.kills.items()}
         return {**plain, **{kind: self.count(kind) for kind in KINDS}}
 

@@ -1,5 +1,6 @@
 """The campaign itself on toy stages: a few kills, and that it notices what it is there to notice."""
 
+import json
 import shutil
 import sys
 
@@ -23,6 +24,7 @@ def test_killed_at_random_moments_and_then_the_same_command(tmp_path):
     print("\n".join(report(tally, SEED, STAGES)))
     assert tally.failures == [] and sum(tally.kills.values()) == 8 and tally.runs >= 1
     assert headline(tally).startswith("faults: 8 kills")
+    assert sum(json.loads(json.dumps(tally.as_json()))["targets"].values()) == 8
 
 
 def test_kills_are_drawn_from_a_seed_and_fall_on_every_stage():

@@ -129,6 +129,17 @@ def test_a_damaged_version_of_other_settings_is_told_apart(toy):
     assert damages(Store(toy.store), "ann", ["bend"]) == []
 
 
+def test_a_flipped_bit_in_an_upstream_record_does_not_mislead_about_what_follows(toy):
+    toy.doit("subject=ann")
+    manifest = toy.store / "ann" / "bend" / LATEST / "manifest.json"
+    digest = manifest.read_text().index('"sha256": "') + len('"sha256": "')
+    flip(manifest, digest, 0)  # still a manifest, of another file
+    flip(toy.store / "ann" / "paint" / LATEST / "painted.txt", 0, 0)
+    found = toy.doit("verify:ann")
+    said = found.stdout + found.stderr
+    assert "rerun the stage: doit run bend:ann" in said and "rerun the stage: doit run paint:ann" in said
+
+
 def test_verify_takes_true_or_false(toy):
     run = toy.doit("subject=ann", "verify=perhaps")
     assert run.returncode != 0 and "verify=perhaps: it must be true or false" in run.stderr
