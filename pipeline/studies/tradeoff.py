@@ -300,8 +300,8 @@ def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = T
     if knob.name == "number of Gaussians" and math.isfinite(entry.gaussians + study.base.gaussians):
         before, after = (f"{one.gaussians:,.0f} Gaussians" for one in (study.base, entry))
     time = f"{ratio:.1f} times the training time" if abs(ratio - 1) > 0.05 else "no more training time"
-    start = "Going from" if first else "going from"
-    return f"{start} {before} to {after}, at {time}: {gain:+.1f} dB"
+    change = after if after.startswith("with") else f"from {before} to {after}"
+    return f"{'Going' if first else 'going'} {change}, at {time}: {gain:+.1f} dB"
 
 
 def told_size(study: Study, entry: Entry) -> str:
