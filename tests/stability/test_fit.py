@@ -152,7 +152,7 @@ def assert_sane(registration, cameras):
     assert error.isfinite().all()
 
 
-QUICK_OF_LM = ("nothing visible", "one joint visible", "all detections on one point", "upside down")
+QUICK_OF_LM = ("nothing visible", "upside down")
 """The second-order solver takes seconds a case; its others are for the soak."""
 EACH = [
     pytest.param(case, solver, marks=[] if solver == "adam" or case in QUICK_OF_LM else [pytest.mark.soak])
@@ -361,14 +361,14 @@ def test_five_thousand_frames_fit_in_bounded_memory(model, solver):
 
     clip = make_clip(*model, count=5000)
     settings = dataclasses.replace(STEPS[solver], iterations=40)
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    start = time.process_time()
     fitted = register(*model, clip.keypoints, clip.cameras, settings)
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     spent = time.process_time() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # making the clip poses 5,000 meshes
     error = fitted.error[~fitted.error.isnan()].mean()
-    print(f"{solver}: 5,000 frames, {spent:.0f} s of processor time, {grown:.0f} MiB more, {error:.2f} px")
+    print(f"{solver}: 5,000 frames, {spent:.0f} s of processor time, {peak:.0f} MiB at most, {error:.2f} px")
     assert_sane(fitted, clip.cameras)
-    assert grown < 2000
+    assert peak < 2000
 
 
 def test_windows_bound_the_memory_of_a_long_clip(model, clip):
