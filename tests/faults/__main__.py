@@ -101,7 +101,7 @@ def report(tally: Tally, seed: int, stages: tuple[str, ...]) -> list[str]:
         f"files with other bytes: {tally.count(DIFFERENT)} (not compared: run.json, and "
         f"{', '.join(SHOWS_TIMES)}, which show how long things took)",
         f"bits flipped in files of every kind: {tally.flipped}, not found: {tally.count(UNNOTICED)}; "
-        "then one in every stage, and all made again by one command",
+        f"then one in every stage, all made again by one command: {'yes' if tally.mended else 'not seen'}",
         f"left behind, hidden: {dict(tally.left) or 'nothing'}",
         f"seconds: {tally.seconds:.0f} ({A_STAGE} kills a stage between two whole runs)",
         *(f"FAILED: {failure}" for failure in tally.failures),

@@ -36,6 +36,7 @@ class Tally:
         failures: what went wrong, in words; each begins with one of ``KINDS``.
         left: what finished runs left behind, hidden and harmless.
         flipped: bits that were flipped in finished results, a file of each kind.
+        mended: whether one command was seen to make a damaged file of every stage again, with equal bytes.
         seconds: of all of it.
     """
 
@@ -47,6 +48,7 @@ class Tally:
     failures: list[str] = dataclasses.field(default_factory=list)
     left: Counter[str] = dataclasses.field(default_factory=Counter)
     flipped: int = 0
+    mended: bool = False
     seconds: float = 0.0
 
     def count(self, kind: str) -> int:
@@ -211,7 +213,9 @@ class Campaign:
         ]
         for kind in missed:
             self.fail(UNNOTICED, f"a flipped bit in {kind}", run)
+        before = len(self.tally.failures)
         self.through(Run(dataclasses.replace(self.project, words=(*self.project.words, "verify=true"))))
+        self.tally.mended = len(self.tally.failures) == before
 
     def expect(self, run: Run, status: int) -> None:
         """Notes a run that does not end with this status."""
