@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from pipeline.artifact import Store
-from pipeline.stage import load_stages
+from pipeline.stage import load_stages, usual
 from pipeline.workspace import REPOSITORY
 
 SUBJECT = "tiny"
@@ -58,7 +58,7 @@ class Project:
     Attributes:
         words: the command line's.
         subject: who.
-        stages: every stage, upstream first.
+        stages: those that the command runs, upstream first.
         artifacts: the store's folder.
     """
 
@@ -98,4 +98,4 @@ def real_project(root: Path, assets: Path) -> Project:
     (data / "subjects" / f"{SUBJECT}.toml").write_text(TINY, encoding="utf-8")
     artifacts = root / "artifacts"
     words = (f"subject={SUBJECT}", f"data={data}", f"artifacts={artifacts}", f"assets={assets}")
-    return Project(words, SUBJECT, tuple(load_stages()), artifacts)
+    return Project(words, SUBJECT, tuple(usual(load_stages())), artifacts)
