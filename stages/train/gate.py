@@ -56,11 +56,14 @@ class Gate(nn.Module):
     Attributes:
         hits, looked: [2, K] int64, how many drawn frames showed each of the avatar's body vertices, and how
             many were looked at; captured and generated frames.
-        line: the last line that was drawn; None before the warm-up has ended.
+        lined_hits, lined_looked: the same when the last line was drawn, for a run that goes on from a
+            checkpoint after it.
     """
 
     hits: Tensor
     looked: Tensor
+    lined_hits: Tensor
+    lined_looked: Tensor
 
     def __init__(self, avatar: Avatar, vertices: int, settings: TrainSettings):
         """Counts nothing yet.
@@ -72,10 +75,9 @@ class Gate(nn.Module):
         """
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
-        for name in ("hits", "looked"):
+        for name in ("hits", "looked", "lined_hits", "lined_looked"):
             counts = torch.zeros(2, len(avatar.kept), dtype=torch.long, device=avatar.device)
             self.register_buffer(name, counts)
-        self.line: Line | None = None
         self._first = avatar.active.clone()  # what is trained while the gate stays open
 
     @property
@@ -128,19 +130,31 @@ class Gate(nn.Module):
         first = round(settings.gate_from * settings.iterations)
         return iteration >= max(1, first) and (iteration - first) % settings.gate_every == 0
 
+    @property
+    def line(self) -> Line | None:
+        """The last line that was drawn; None before the warm-up has ended."""
+        return self._drawn()[0] if bool(self.lined_looked.any()) else None
+
     def update(self) -> Line:
         """Draws the line and gates what lies below it."""
-        captured, generated = self.scores()
-        self.line = self._line(self.whole_body(captured))
-        active = captured >= self.line.tau
-        if self._settings.unseen == "generated":
-            active |= (generated >= self.line.tau) & (self.looked[GENERATED] > 0)
-        if self.line.closed and not bool(active.any()):
-            why = f"a line at {self.line.tau:.2f} would gate all of the body, so none is drawn"
-            self.line = dataclasses.replace(self.line, tau=0.0, why=why)
+        self.lined_hits.copy_(self.hits)
+        self.lined_looked.copy_(self.looked)
+        line, active = self._drawn()
         faces, rings = self.avatar.surfaces[0].canonical.faces, self._settings.gate_rings
-        self.avatar.gate(dilate(active, faces, rings) if self.line.closed else self._first)
-        return self.line
+        self.avatar.gate(dilate(active, faces, rings) if line.closed else self._first)
+        return line
+
+    def _drawn(self) -> tuple[Line, Tensor]:
+        """The line through the scores as they were, and what lies above it."""
+        captured, generated = self.lined_hits / self.lined_looked.clamp_min(1)
+        line = self._line(self.whole_body(captured))
+        active = captured >= line.tau
+        if self._settings.unseen == "generated":
+            active |= (generated >= line.tau) & (self.lined_looked[GENERATED] > 0)
+        if line.closed and not bool(active.any()):
+            why = f"a line at {line.tau:.2f} would gate all of the body, so none is drawn"
+            line = dataclasses.replace(line, tau=0.0, why=why)
+        return line, active
 
     def _line(self, scores: np.ndarray) -> Line:
         settings = self._settings

@@ -161,10 +161,11 @@ def test_one_training_frame_is_enough_for_a_line(subject, tmp_path):
     assert set(trainer.gate.scores()[0].unique().tolist()) == {0.0, 1.0} and trainer.gate.line.closed
 
 
-def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tmp_path, monkeypatch):
-    whole = context_for(subject, tmp_path / "whole", **LATE)
+@pytest.mark.parametrize("looks", [{}, {"gate_every": 100}], ids=["a look after it", "none after it"])
+def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tmp_path, monkeypatch, looks):
+    whole = context_for(subject, tmp_path / "whole", **LATE | looks)
     stage.run(whole)
-    context = context_for(subject, tmp_path / "out", **LATE)
+    context = context_for(subject, tmp_path / "out", **LATE | looks)
     original = Trainer.step
 
     def step(self):
