@@ -30,8 +30,8 @@ from pipeline.metrics.protocol import composite
 from pipeline.records import read_split
 from pipeline.splat import Gaussians, render
 from pipeline.study import made
+from pipeline.turntable import orbit, visible_extent
 from stages.evaluate.scoring import Scorer
-from stages.evaluate.turntable import orbit, visible_extent
 
 SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}

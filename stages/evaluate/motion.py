@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
 from pipeline.splat import Gaussians, render
+from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.rendering import Animate, on_grey
-from stages.evaluate.turntable import Extent, orbit, relaxed_pose, visible_extent
 
 HEAD_TURN = 0.6  # radians to either side
 ARM_RAISE = 1.9  # radians, from hanging to above the horizontal

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.bake import bake
+from pipeline.camera import Camera
 from pipeline.metrics.protocol import BLACK, over
 from pipeline.splat import Gaussians, Rendering, render
 from stages.evaluate.evidence import Evidence, Pose
@@ -55,6 +56,13 @@ def on_grey(rendering: Rendering) -> np.ndarray:
     """The picture for people: dark hair and a white shirt both stand out; [H, W, 3] uint8 RGB."""
     image = rendering.color + (1 - rendering.alpha[..., None]) * GREY
     return to_bytes(image)
+
+
+@torch.no_grad()
+def turn_pictures(gaussians: Gaussians, cameras: list[Camera]) -> Iterator[np.ndarray]:
+    """What each camera sees on grey, [H, W, 3] uint8 RGB."""
+    for camera in cameras:
+        yield on_grey(render(gaussians, camera))
 
 
 def to_bytes(image: Tensor) -> np.ndarray:

@@ -23,6 +23,7 @@ from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context
+from pipeline.turntable import orbit, relaxed_pose, visible_extent
 from pipeline.versions import versions
 from stages.evaluate import STAGE
 from stages.evaluate.assessment import Assessment, Extras, assess, scored_frames
@@ -43,14 +44,13 @@ from stages.evaluate.records import (
     stage_records,
 )
 from stages.evaluate.refinement import NONE, Refinement, called_for, refine, write_refined
-from stages.evaluate.rendering import Animate, animator, follower, on_grey, render_frame
+from stages.evaluate.rendering import Animate, animator, follower, on_grey, render_frame, turn_pictures
 from stages.evaluate.report import Material, write_report
 from stages.evaluate.scoring import Score, Scorer, write_scores
 from stages.evaluate.second_mask import second_masks
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summarise import summarise
 from stages.evaluate.summary import show_summary
-from stages.evaluate.turntable import orbit, relaxed_pose, turn_pictures, visible_extent
 from stages.evaluate.verdict import Sides, verdict
 from stages.evaluate.views import read_filmed, score_views, view_folders
 

@@ -15,7 +15,7 @@ from pipeline.plan import EFFECTS, read_plan
 from pipeline.records import Split, write_split
 from pipeline.splat import Gaussians, render
 from pipeline.tables import write_table
-from stages.evaluate.turntable import orbit, visible_extent
+from pipeline.turntable import orbit, visible_extent
 from stages.plan import measure
 from stages.plan.run import run as run_plan
 from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, stand_in

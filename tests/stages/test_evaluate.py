@@ -15,13 +15,13 @@ from pipeline.errors import UserError
 from pipeline.frames import write_mask, write_png
 from pipeline.metrics import PSNR_CAP
 from pipeline.splat import read_ply
+from pipeline.turntable import relaxed_pose
 from stages.evaluate import STAGE, curve, plan_table, records
 from stages.evaluate.evidence import evenly, read_evidence
 from stages.evaluate.run import evaluate, report_place
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import show_summary
-from stages.evaluate.turntable import relaxed_pose
 from stages.train.gate import SCHEMA as VISIBILITY
 from tests.stages.evaluate_subject import (
     FRAMES,

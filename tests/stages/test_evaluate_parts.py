@@ -7,11 +7,12 @@ import torch
 
 from pipeline.camera import project, to_camera
 from pipeline.splat import Gaussians
+from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.baselines import mean_frame, nearest_frames
 from stages.evaluate.evidence import evenly
 from stages.evaluate.pictures import compare, comparison_sheet, person_box
+from stages.evaluate.rendering import turn_pictures
 from stages.evaluate.scoring import Score, table
-from stages.evaluate.turntable import Extent, orbit, relaxed_pose, turn_pictures, visible_extent
 from tests.stages.evaluate_subject import stand_in
 
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from pipeline.body.joints import JOINT_NAMES
+from pipeline.turntable import relaxed_pose
 from pipeline.versions import PACKAGES, commit, package_version, versions
 from stages.evaluate.motion import motion_pictures, motion_poses
-from stages.evaluate.turntable import relaxed_pose
 from stages.evaluate.verdict import Sides, limits, quality, turned, verdict
 from tests.stages.evaluate_subject import stand_in
 
