@@ -7,6 +7,7 @@ Texels that only it would read are in no product any more, so that their gradien
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,7 +47,7 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
     canonical, count = surface.canonical, len(surface.canonical)
     place = torch.full((count,), -1, dtype=torch.long, device=rows.device)
     place[rows] = torch.arange(len(rows), device=rows.device)
-    chosen = {
+    chosen: dict[str, Any] = {
         name: None if (values := getattr(canonical, name)) is None else values[rows]
         for name in (
             "vertices", "skinning_weights", "expression_directions", "pose_directions", "parts", "frames",

@@ -11,6 +11,7 @@ interrupted study goes on as it would have; a point whose results are in the sto
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -105,9 +106,7 @@ class Design:
             for place, level in enumerate(point):
                 if level:
                     guess = self.knobs[place].levels[level].factor if stage == TRAIN else 1.0
-                    expected *= self.ratio(
-                        place, level, lambda one, s=stage: one.seconds.get(s, math.nan), guess
-                    )
+                    expected *= self.ratio(place, level, functools.partial(_seconds, stage), guess)
             total += expected
         return total
 
@@ -159,6 +158,10 @@ def area(points: Sequence[tuple[float, float]], corner: tuple[float, float]) -> 
         (math.log(end) - math.log(costs[place])) * max(0.0, qualities[place] - corner[1])
         for place, end in zip(kept, ends, strict=True)
     )
+
+
+def _seconds(stage: str, one: Made) -> float:
+    return one.seconds.get(stage, math.nan)
 
 
 def next_single(

@@ -232,10 +232,12 @@ def presets_of(explorer: Explorer, words: Mapping[str, str], workspace: Workspac
             found.append(Preset(path.stem, cost))
             continue
         ending = attempt(explorer.subject, Variant(f"preset {path.stem}"), own, explorer.log, (TRAIN,))
-        quality = explorer.judge(ending) if isinstance(ending, Outcome) else math.nan
-        explorer.tell(ending, quality)
-        done = isinstance(ending, Outcome)
-        found.append(Preset(path.stem, cost_of(ending), ending) if done else Preset(path.stem, cost))
+        if isinstance(ending, Outcome):
+            explorer.tell(ending, explorer.judge(ending))
+            found.append(Preset(path.stem, cost_of(ending), ending))
+        else:
+            explorer.tell(ending, math.nan)
+            found.append(Preset(path.stem, cost))
     return found
 
 

@@ -64,6 +64,10 @@ def knobs_of(settings: Mapping[str, Any]) -> tuple[Knob, ...]:
 
 
 def _level(label: str, factor: float = 1.0, stage: str = "train", **words: Any) -> Level:
+    return _worded(label, factor, stage, words)
+
+
+def _worded(label: str, factor: float, stage: str, words: Mapping[str, Any]) -> Level:
     return Level(label, {f"{stage}.{name}": _text(value) for name, value in words.items()}, factor)
 
 
@@ -151,9 +155,9 @@ def _residuals(train: Any) -> Knob | None:
 def _weight(name: str, now: float, field: str, weight: float, factor: float) -> Knob:
     """A term of the objective: out if it is in, in with ``weight`` if it is out."""
     other = (
-        _level(f"without {name}", 1 / factor, **{field: 0})
+        _worded(f"without {name}", 1 / factor, "train", {field: 0})
         if now
-        else _level(f"with {name} ({weight:g})", factor, **{field: weight})
+        else _worded(f"with {name} ({weight:g})", factor, "train", {field: weight})
     )
     return Knob(name, (Level(f"{'with' if now else 'without'} {name}"), other))
 

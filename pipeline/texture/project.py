@@ -142,10 +142,10 @@ def sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """A picture's values between its pixels: [H, W, 3] uint8, [N, 2] float32 -> [N, 3] uint8."""
     width = 4096  # OpenCV takes no map of 32,768 rows or more
     height = -(-len(pixels) // width)
-    grid = np.zeros((height * width, 2), np.float32)
-    grid[: len(pixels)] = pixels - 0.5
-    grid = grid.reshape(height, width, 2)
-    found = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    places = np.zeros((2, height * width), np.float32)
+    places[:, : len(pixels)] = (pixels - 0.5).T
+    x, y = places.reshape(2, height, width)
+    found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return found.reshape(-1, 3)[: len(pixels)]
 
 

@@ -115,7 +115,8 @@ def crop(
     parts = [image[top:bottom, left:right], cut, trust]
     if size != (view.width, view.height):
         parts = [cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts]
-    return Cropped(*(np.ascontiguousarray(part) for part in parts), view.resized(*size), news)
+    image, cut, trust = (np.ascontiguousarray(part) for part in parts)
+    return Cropped(image, cut, trust, view.resized(*size), news)
 
 
 def _box(camera: Camera, points: Tensor) -> tuple[int, int, int, int] | None:

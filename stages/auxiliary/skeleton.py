@@ -86,7 +86,7 @@ def _draw_body(canvas: np.ndarray, points: np.ndarray) -> None:
         middle, along = ends.mean(0), ends[0] - ends[1]
         length, angle = float(np.hypot(*along)), float(np.degrees(np.arctan2(along[1], along[0])))
         axes = (int(length / 2), _LIMB_WIDTH)
-        polygon = cv2.ellipse2Poly(_place(*middle), axes, int(angle), 0, 360, 1)
+        polygon = np.array(cv2.ellipse2Poly(_place(*middle), axes, int(angle), 0, 360, 1))
         cv2.fillConvexPoly(canvas, polygon, [int(part * score) for part in color])
     canvas[:] = (canvas * DIMMED).astype(np.uint8)
     for (x, y, score), color in zip(points, _RAINBOW, strict=True):

@@ -99,9 +99,8 @@ def joined(captured: Poses, made: Poses) -> Poses:
     """The poses of both, captured ones first."""
     return Poses(
         (*captured.frames, *made.frames),
-        *(
-            torch.cat([getattr(p, name) for p in (captured, made)])
-            for name in ("rotation", "expression", "transl")
-        ),
+        rotation=torch.cat([captured.rotation, made.rotation]),
+        expression=torch.cat([captured.expression, made.expression]),
+        transl=torch.cat([captured.transl, made.transl]),
         valid=torch.cat([captured.valid, made.valid]),
     )

@@ -169,7 +169,7 @@ class TrainSettings:
             "device": DEVICES,
         }  # fmt: skip
         for name, known in words.items():
-            self._require((name,), lambda value, known=known: value in known, f"be one of {', '.join(known)}")
+            self._require((name,), known.__contains__, f"be one of {', '.join(known)}")
         if self.gate_threshold is not None:
             self._require(("gate_threshold",), lambda value: 0 < value <= 1, "lie between 0 and 1")
         self._require(

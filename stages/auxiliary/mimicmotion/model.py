@@ -128,8 +128,9 @@ def load_model(folder: Path, device: torch.device, dtype: torch.dtype) -> Model:
             unet.load_state_dict(replaced)
     except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
         raise UserError(f"{folder} cannot be read as MimicMotion ({error}): {_REMEDY}") from error
-    networks = [network.to(device).eval().requires_grad_(False) for network in (unet, pose_net, vae, encoder)]
-    return Model(*networks, scheduler)
+    networks: tuple[Any, ...] = (unet, pose_net, vae, encoder)
+    unet, pose_net, vae, encoder = (network.to(device).eval().requires_grad_(False) for network in networks)
+    return Model(unet, pose_net, vae, encoder, scheduler)
 
 
 def _under(entries: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
