@@ -47,7 +47,8 @@ class Outcome:
         means: split -> method -> metric -> mean over frames, as in summary.json.
         gaussians: of the avatar.
         seconds: stage -> wall-clock seconds of the run that made its result.
-        cpu_seconds: stage -> processor seconds of it, of all threads: less disturbed by other jobs.
+        cpu_seconds: stage -> processor seconds of it, of all threads: less disturbed by other jobs. Less
+            what compiled kernels, for the first run of a study pays that for all.
         folders: stage -> where its result lies.
     """
 
@@ -146,8 +147,9 @@ def _summary(folder: Path | None) -> dict[str, Any]:
 
 def _cpu_seconds(record: Mapping[str, Any]) -> float:
     """Of a run and of those that were killed before it, up to the checkpoint that it went on from."""
-    earlier = record.get("timings", {}).get("earlier_cpu_seconds", 0.0)
-    return record.get("cpu_seconds", float("nan")) + earlier
+    timings = record.get("timings", {})
+    more = timings.get("earlier_cpu_seconds", 0.0) - timings.get("compile_cpu_seconds", 0.0)
+    return record.get("cpu_seconds", float("nan")) + more
 
 
 def _run(job: Job, stage: str, log: Path | None) -> None:

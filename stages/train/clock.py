@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from pipeline.compiling import CompileTimer
+
 NAME = "clock.json"
 
 Mark = tuple[int, float, float]
@@ -15,26 +17,33 @@ Mark = tuple[int, float, float]
 
 
 class Clock:
-    """Seconds of the iterations alone: what is only looked at on the way does not count.
+    """Seconds of the iterations alone: what is compiled or only looked at on the way does not count.
 
     Attributes:
         marks: of the points of the curve.
         earlier: of the processes that were killed before this one, up to their last checkpoint.
     """
 
-    def __init__(self, work: Path, iteration: int):
+    def __init__(self, work: Path, iteration: int, compiled: CompileTimer):
         """Starts; goes on from the marks of a killed run if training goes on from its checkpoint.
 
         Args:
             work: the folder with the checkpoint.
             iteration: steps done at the start.
+            compiled: what this process has compiled.
         """
+        self._compiled = compiled
         self._file = work / NAME
         self.marks: list[Mark] = []
         self.earlier: Mark = (0, 0.0, 0.0)
         if iteration:
             self._read(iteration)
-        self._wall, self._cpu = time.monotonic(), time.process_time()
+        self._wall, self._cpu = self._spent()
+
+    def _spent(self) -> tuple[float, float]:
+        """Seconds of this process, less what it compiled."""
+        compiled = self._compiled
+        return time.monotonic() - compiled.seconds, time.process_time() - compiled.cpu_seconds
 
     def _read(self, iteration: int) -> None:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -45,8 +54,12 @@ class Clock:
 
     def now(self, iteration: int) -> Mark:
         """The mark of this moment."""
-        wall, cpu = time.monotonic() - self._wall, time.process_time() - self._cpu
-        return iteration, round(self.earlier[1] + wall, 3), round(self.earlier[2] + cpu, 3)
+        wall, cpu = self._spent()
+        return (
+            iteration,
+            round(self.earlier[1] + wall - self._wall, 3),
+            round(self.earlier[2] + cpu - self._cpu, 3),
+        )
 
     def mark(self, iteration: int) -> None:
         """Notes a point of the curve."""
@@ -60,9 +73,10 @@ class Clock:
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
         """What happens inside is not training."""
-        wall, cpu = time.monotonic(), time.process_time()
+        before = self._spent()
         try:
             yield
         finally:
-            self._wall += time.monotonic() - wall
-            self._cpu += time.process_time() - cpu
+            now = self._spent()
+            self._wall += now[0] - before[0]
+            self._cpu += now[1] - before[1]

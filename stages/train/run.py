@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
+from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
@@ -88,11 +89,13 @@ def run(context: Context) -> None:
         UserError: if the inputs do not go together, or training diverges.
         NotFiniteError: a number of it is not finite; names it, the iteration and the frame.
     """
-    with threads(context.settings.threads):
-        train_subject(context)
+    with threads(context.settings.threads), compile_timer() as compiled:
+        train_subject(context, compiled)
+        context.timing("compile_seconds", compiled.seconds)
+        context.timing("compile_cpu_seconds", compiled.cpu_seconds)
 
 
-def train_subject(context: Context) -> None:
+def train_subject(context: Context, compiled: CompileTimer) -> None:
     """Reads the inputs, trains what the plan calls for, and writes what is published."""
     inputs = read_inputs(context)
     settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
@@ -106,7 +109,7 @@ def train_subject(context: Context) -> None:
     gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
     trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network, gate)
     context.timing("prepare_seconds", time.monotonic() - started)
-    train(trainer, inputs, context)
+    train(trainer, inputs, context, compiled)
     trainer.require_finite()
     publish(trainer, inputs, context)
     context.timing("saved", saved(avatar, len(inputs.body.v_template), context.settings, settings))
@@ -216,14 +219,14 @@ def architecture(settings: TrainSettings) -> Architecture:
     return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
 
 
-def train(trainer: Trainer, inputs: Inputs, context: Context) -> None:
+def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileTimer) -> None:
     """Runs the iterations that are left, with checkpoints and points of the curve."""
     settings = trainer.settings
     poses = inputs.all_poses
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
-    clock, first = Clock(context.work, trainer.iteration), trainer.iteration
+    clock, first = Clock(context.work, trainer.iteration, compiled), trainer.iteration
     watched = shown or spread(inputs.split.train, WATCHED)
     if trainer.untrained is None:
         with clock.aside():

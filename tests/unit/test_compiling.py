@@ -1,0 +1,48 @@
+"""What compiling costs is told apart from what a run costs."""
+
+import numba
+import numpy as np
+import pytest
+
+from pipeline.compiling import CompileTimer, compile_timer
+from stages.train.clock import Clock
+
+
+def sums(values):
+    """The sum of squares by a function that calls another."""
+
+    @numba.njit
+    def square(value):
+        return value * value
+
+    @numba.njit
+    def total(values):
+        found = 0.0
+        for value in values:
+            found += square(value)
+        return found
+
+    return total(values), total
+
+
+def test_only_what_is_compiled_while_it_listens_is_counted():
+    with compile_timer() as timer:
+        found, total = sums(np.ones(3))
+        first = timer.seconds, timer.cpu_seconds
+        total(np.ones(5))  # compiled already
+        assert (timer.seconds, timer.cpu_seconds) == first
+        total(np.ones(5, np.float32))  # not for these numbers
+        assert timer.seconds > first[0] and timer.cpu_seconds > first[1]
+    last = timer.seconds
+    total(np.ones(5, np.int64))  # nobody listens
+    assert found == 3 and min(first) > 0 and timer.seconds == last
+
+
+def test_a_clock_leaves_out_what_was_compiled(tmp_path):
+    compiled = CompileTimer()
+    clock = Clock(tmp_path, 0, compiled)
+    compiled.seconds, compiled.cpu_seconds = 50.0, 40.0  # on the way
+    assert clock.now(1)[1:] == pytest.approx((-50, -40), abs=5)
+    with clock.aside():
+        compiled.seconds, compiled.cpu_seconds = 150.0, 140.0  # while it was only looked at
+    assert clock.now(2)[1:] == pytest.approx((-50, -40), abs=5)
