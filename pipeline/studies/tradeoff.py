@@ -281,10 +281,7 @@ def sentence(study: Study) -> str:
     gaining = [one for one in known if one[1] > least]
     if not gaining:
         chance = f"more than another seed does ({least:.1f} dB)" if math.isfinite(noise) else "anything"
-        return (
-            f"No single change that was tried gains {chance}: stay with {told_size(study, base)}, "
-            "or take what is cheaper."
-        )
+        return f"No single change that was tried gains {chance}: {_told_cheapest(study, least)}."
     worth = max(gaining, key=lambda one: one[1] / max(math.log(max(one[2], 1.02)), 1e-3))
     most = max(gaining, key=lambda one: one[1])
     text = _told(study, *worth)
@@ -302,6 +299,18 @@ def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = T
     time = f"{ratio:.1f} times the training time" if abs(ratio - 1) > 0.05 else "no more training time"
     change = after if after.startswith("with") else f"from {before} to {after}"
     return f"{'Going' if first else 'going'} {change}, at {time}: {gain:+.1f} dB"
+
+
+def _told_cheapest(study: Study, least: float) -> str:
+    """The cheapest entry that is no worse than the base by more than chance, at the price of what."""
+    base = study.base
+    as_good = [one for one in study.choices if one.get("psnr") >= base.get("psnr") - least]
+    cheapest = min(as_good, key=lambda one: one.cost)
+    if cheapest.cost > 0.95 * base.cost:
+        return f"stay with {told_size(study, base)}"
+    perceived = f"LPIPS×100 {100 * cheapest.get('lpips_alex'):.1f}, was {100 * base.get('lpips_alex'):.1f}"
+    time = f"{cheapest.cost / base.cost:.1f} times the training time"
+    return f"{cheapest.label}, at {time}, does as well in PSNR ({perceived})"
 
 
 def told_size(study: Study, entry: Entry) -> str:

@@ -222,6 +222,14 @@ def test_one_sentence_says_what_pays(tmp_path):
     assert "+2.0 dB" in told and "4.0 times the training time" in told
     idle = sentence(study(tmp_path, gains=(0.0, 0.05, 0.0, 0.1)))
     assert "No single change that was tried gains more than another seed does (0.1 dB)" in idle
+    assert idle.endswith("stay with 5,000 Gaussians and 100 iterations.")  # nothing is cheaper
+
+
+def test_what_is_cheaper_and_as_good_is_named_with_its_price(tmp_path):
+    told = sentence(study(tmp_path, gains=(0.0, -0.05, -0.3, 0.1), costs=(20.0, 8.0, 4.0, 20.0)))
+    assert told.endswith(
+        "point 2, at 0.4 times the training time, does as well in PSNR (LPIPS×100 5.0, was 5.0)."
+    )
 
 
 def test_a_tradeoff_is_drawn_and_written(tmp_path):
