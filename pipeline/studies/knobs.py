@@ -99,15 +99,16 @@ def _gaussians(train: Any) -> Knob:
 
 
 def _image(ingest: Any) -> Knob:
-    def size(factor: float) -> int:
-        return 8 * round(ingest.long_side * factor / 8)
+    # A mannequin is filmed at the size that it has; footage is reduced.
+    side, field = (
+        (ingest.mannequin_size, "mannequin_size") if ingest.mannequin else (ingest.long_side, "long_side")
+    )
 
-    if ingest.mannequin:  # filmed at mannequin_size, which is no larger
-        side = ingest.mannequin_size
-        levels = [_level(f"{side // 2} px", 0.8, "ingest", long_side=side // 2)]
-        return Knob("image size", (Level(f"{side} px"), *levels))
-    levels = [_level(f"{size(f)} px", f**0.5, "ingest", long_side=size(f)) for f in (0.5, 1.5)]
-    return Knob("image size", (Level(f"{ingest.long_side} px"), *levels))
+    def level(factor: float) -> Level:
+        size = 8 * round(side * factor / 8)
+        return _worded(f"{size} px", factor**0.5, "ingest", {field: size})
+
+    return Knob("image size", (Level(f"{side} px"), level(0.5), level(1.5)))
 
 
 def _fit_effort(fit: Any) -> Knob:

@@ -129,6 +129,15 @@ def test_every_level_of_every_knob_can_be_set_and_changes_something(subject, pre
             assert level.factor > 0
 
 
+@pytest.mark.parametrize(
+    ("subject", "words"),
+    [("smile", {"ingest.long_side": "256"}), ("mannequin_head", {"ingest.mannequin_size": "128"})],
+)
+def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
+    knobs = {knob.name: knob for knob in knobs_of(job_from_words(subject, {}).settings)}
+    assert knobs["image size"].levels[1].words == words  # long_side does nothing to what is filmed here
+
+
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("20m", 1200), ("1.5h", 5400), ("45", 45)])
 def test_budgets(text, seconds):
     assert seconds_of(text) == seconds
