@@ -26,6 +26,7 @@ DECIDED = (
     "left_hand_residual",
     "right_hand_residual",
     "face_loss",
+    "subdivision",
     "pose_heads",
     "visibility_gate",
     "auxiliary_views",
@@ -69,7 +70,8 @@ class Decision:
         forced: whether a setting decided instead of the number.
         values: what else was measured. Of ``auxiliary_views``: the azimuths that no training frame
             saw, centres of bins of ``AZIMUTH_STEP`` degrees. Azimuth 0 is a camera in front of the
-            person, 90 one on the person's left, 180 one behind.
+            person, 90 one on the person's left, 180 one behind. Of ``subdivision``: how many levels the
+            pixels call for.
     """
 
     effect: str

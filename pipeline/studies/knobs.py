@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+LEVELS = ("no subdivision", "one subdivision", "two subdivisions")
 CHANCE = "chance"  # the knob that buys nothing: another seed
 
 
@@ -49,7 +50,7 @@ def knobs_of(settings: Mapping[str, Any]) -> tuple[Knob, ...]:
     train, fit, ingest = settings["train"], settings["fit"], settings["ingest"]
     knobs = [
         _iterations(train),
-        _gaussians(train),
+        _gaussians(train, settings["plan"]),
         _image(ingest),
         _fit_effort(fit),
         _switch("precision", train.half_precision, ("bfloat16", "float32"), "train.half_precision", 1.5),
@@ -88,14 +89,30 @@ def _iterations(train: Any) -> Knob:
     return Knob("iterations", (Level(f"{train.iterations:,} iterations"), *(level(*one) for one in counts)))
 
 
-def _gaussians(train: Any) -> Knob:
-    names = ("no subdivision", "one subdivision", "two subdivisions")
+def _gaussians(train: Any, plan: Any) -> Knob:
+    """Levels of subdivision whatever the pixels; the study's own is what the plan leaves of it."""
+    own = 0 if plan.subdivision == "off" else train.subdivisions
+    planned = own > 0 and plan.subdivision == "auto"  # then nobody knows yet which of them it is
     others = [
-        _level(names[level], 1.8 ** (level - train.subdivisions), subdivisions=level)
-        for level in range(3)
-        if level != train.subdivisions
+        Level(
+            LEVELS[level],
+            {"train.subdivisions": str(level), "plan.subdivision": "on"},
+            1.8 ** (level - own),
+        )
+        for level in range(len(LEVELS))
+        if planned or level != own
     ]
-    return Knob("number of Gaussians", (Level(names[train.subdivisions]), *others))
+    return Knob("number of Gaussians", (Level(mesh_of(train, plan)), *others))
+
+
+def mesh_of(train: Any, plan: Any) -> str:
+    """How fine a run's mesh becomes, in words.
+
+    Args:
+        train, plan: the two stages' settings.
+    """
+    own = 0 if plan.subdivision == "off" else train.subdivisions
+    return f"at most {LEVELS[own]}" if own and plan.subdivision == "auto" else LEVELS[own]
 
 
 def _image(ingest: Any) -> Knob:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 from pipeline.artifact import MANIFEST, RUN
 from pipeline.job import job_from_words
+from pipeline.studies.knobs import mesh_of
 from pipeline.study import Outcome
 
 LIBRARIES = ("torch", "numba", "numpy")
@@ -23,9 +24,8 @@ def sizes_of(words: Mapping[str, str], outcome: Outcome) -> str:
     """
     settings = job_from_words(outcome.subject, words).settings
     train, ingest = settings["train"], settings["ingest"]
-    level = ("no subdivision", "one subdivision", "two subdivisions")[train.subdivisions]
     side = ingest.mannequin_size if ingest.mannequin else ingest.long_side
-    own = f"{train.iterations:,} iterations, {level}, pictures of {side} px"
+    own = f"{train.iterations:,} iterations, {mesh_of(train, settings['plan'])}, pictures of {side} px"
     small = (
         ""
         if train.iterations >= 1000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
 from pipeline.visibility import LEAST_CUT, evidence_threshold
 from stages.plan.measure import (
     Clip,
+    gaussian_pixels,
     mean_error,
     part_pixels,
     pose_change,
@@ -29,6 +31,11 @@ PART_SEEN = 0.1
 # Pixels across. Hands of the full mannequin (21 to 23) and its face (24) hold fewer pixels than Gaussians
 # stand there: nothing finer is left to add. The upper mannequin's hand has 76, its face 72.
 RESIDUAL_PIXELS = 32.0
+
+# Pixels from one Gaussian to the next. Whole bodies at 256 to 512 pixels have 1.1: four times as many
+# cost 2.6 to 5 times the training and gain nothing in PSNR and 4% of LPIPS; upper bodies have 2.5 and gain
+# 14% of LPIPS, heads 3.3 and more and gain 35% (docs/results.md).
+GAUSSIAN_PIXELS = 1.5
 
 # Of the person's size. Mannequins that stand still, head and upper body: 0.031 and 0.028, which is what the
 # detector's errors leave; those that move: 0.138 and more.
@@ -51,6 +58,7 @@ def decide(clip: Clip, settings: PlanSettings) -> Plan:
         *(part_seen(part, seen) for part in SEEN_PARTS),
         gate(scores),
         azimuths(clip),
+        subdivision(clip),
         poses_follow(clip),
         refinement(clip),
         test_time(clip),
@@ -144,6 +152,14 @@ def azimuths(clip: Clip) -> Decision:
         f"{len(unseen)} of 12 sides are never seen, the widest range without a frame has {widest:.0f} degrees"
     )
     return Decision("auxiliary_views", on, widest, UNSEEN_RANGE, "degrees never seen", why, values=unseen)
+
+
+def subdivision(clip: Clip) -> Decision:
+    """Whether there are more pixels than Gaussians, a vertex of the body each; and for how many levels."""
+    pixels = gaussian_pixels(clip)
+    levels = max(0, math.ceil(math.log2(pixels / GAUSSIAN_PIXELS))) if pixels else 0
+    why = f"the body's vertices that a training frame shows stand {pixels:.1f} pixels apart"
+    return Decision("subdivision", levels > 0, pixels, GAUSSIAN_PIXELS, "pixels apart", why, values=(levels,))
 
 
 def poses_follow(clip: Clip) -> Decision:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
-from pipeline.body import PARTS, BodyModel, Identity, Poses, read_identity, read_poses
-from pipeline.camera import Camera
+from pipeline.body import PARTS, BodyModel, Identity, Poses, pose_body, read_identity, read_poses
+from pipeline.camera import Camera, project, to_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
 from pipeline.person import MARGIN, person_box
@@ -28,6 +29,7 @@ TRUSTED = 0.4  # score from which a keypoint is believed, as in Eq. 2
 SHOWN = 0.5  # share of a part's points that a frame must show
 LEAST_FRAMES = 0.05  # share of the training frames that must show a part for its size to count
 POINTS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
+LOOKED_AT = 16  # training frames, evenly spaced, in which the pixels between vertices are measured
 LEAST_POINTS, ALIGNMENTS, LAG = 4, 3, 2  # of keypoints that are laid over each other; LAG in frames
 
 RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
@@ -117,6 +119,42 @@ def visibility(clip: Clip) -> tuple[np.ndarray, dict[str, float]]:
         most = torch.maximum(most, torch.bincount(labels[seen], minlength=len(PARTS)) / size)
     scores = (hits.double() / len(clip.split.train)).numpy()
     return scores, dict(zip(PARTS, most.tolist(), strict=True))
+
+
+def gaussian_pixels(clip: Clip) -> float:
+    """How far the body's vertices stand from each other in the picture, pixels.
+
+    The root of the area that each has of what faces the camera within the person's box: the mean over
+    ``LOOKED_AT`` training frames. 0 where none of them shows anything.
+    """
+    train = clip.split.train
+    frames = (
+        [train[k * len(train) // LOOKED_AT] for k in range(LOOKED_AT)] if len(train) > LOOKED_AT else train
+    )
+    rows, poses = [clip.poses.index(frame) for frame in frames], clip.poses
+    vertices, _ = pose_body(
+        clip.body, clip.identity, poses.rotation[rows], poses.expression[rows], poses.transl[rows]
+    )
+    found = [
+        _spacing(seen, clip.body.faces, clip.cameras[f]) for seen, f in zip(vertices, frames, strict=True)
+    ]
+    shown = [one for one in found if one > 0]
+    return float(np.mean(shown)) if shown else 0.0
+
+
+def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
+    """Of one frame; 0 where no face of the mesh is seen. vertices [V, 3] world, faces [F, 3]."""
+    pixels, depth = project(camera, vertices), to_camera(camera, vertices)[:, 2]
+    corners = pixels[faces.long()]  # [F, 3, 2]
+    middle = corners.mean(1)
+    size = middle.new_tensor([camera.width, camera.height])
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    # The picture's y axis points down, so that a face whose corners go round to the left is turned away.
+    facing = area < 0
+    seen = facing & ((middle > 0) & (middle < size)).all(1) & (depth[faces.long()] > 0).all(1)
+    # A closed mesh has two faces a vertex.
+    return math.sqrt(float(area[seen].abs().sum()) / (int(seen.sum()) / 2)) if seen.any() else 0.0
 
 
 def part_pixels(clip: Clip, part: str) -> float:

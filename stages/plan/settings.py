@@ -19,6 +19,8 @@ class PlanSettings:
     left_hand_residual: str = "auto"  # of the left hand
     right_hand_residual: str = "auto"  # of the right hand
     face_loss: str = "auto"  # the registered face in its texture against the frames; train.face weighs it
+    # Finer Gaussians, up to train.subdivisions: auto, as fine as the pixels; on, whatever the pixels
+    subdivision: str = "auto"
     pose_heads: str = "auto"  # shape and colour that follow the pose
     visibility_gate: str = "auto"  # no Gaussians for what is seen too seldom
     auxiliary_views: str = "auto"  # generated views of the sides that no frame shows

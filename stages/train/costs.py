@@ -36,6 +36,9 @@ def saved(avatar: Avatar, vertices: int, wanted: TrainSettings, obeyed: TrainSet
     gated = vertices - int(avatar.active.sum())
     if gated:
         found["visibility_gate"] = {"gaussians": float(gated)}
+    lost = wanted.subdivisions - obeyed.subdivisions
+    if lost:  # a level makes four Gaussians of one
+        found["subdivision"] = {"gaussians": float(len(avatar) * (4**lost - 1))}
     if wanted.pose_heads_from < 1 and obeyed.pose_heads_from == 1:
         steps = wanted.iterations * (1 - wanted.pose_heads_from)
         found["pose_heads"] = {"seconds": steps * _pose_heads(avatar)}

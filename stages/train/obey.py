@@ -8,6 +8,7 @@ from pipeline.plan import Plan
 from stages.train.settings import TrainSettings
 
 RESIDUALS = ("face", "left_hand", "right_hand")
+MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 
 
 def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
@@ -23,8 +24,17 @@ def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
         settings,
         residual_parts=parts,
         residual_from=settings.residual_from if parts else 1.0,
+        subdivisions=min(settings.subdivisions, levels_of(plan)),
         pose_heads_from=settings.pose_heads_from if plan.on("pose_heads") else 1.0,
         refine_poses=settings.refine_poses and plan.on("pose_refinement"),
         face=settings.face if plan.on("face_loss") else 0.0,
         gate=settings.gate and plan.on("visibility_gate"),
     )
+
+
+def levels_of(plan: Plan) -> int:
+    """How many levels of subdivision the plan leaves: all where a setting switched it on."""
+    decision = plan["subdivision"]
+    if not decision.on:
+        return 0
+    return MOST_LEVELS if decision.forced or not decision.values else int(decision.values[0])

@@ -138,6 +138,23 @@ def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
     assert knobs["image size"].levels[1].words == words  # long_side does nothing to what is filmed here
 
 
+@pytest.mark.parametrize(
+    ("words", "own", "others"),
+    [
+        ({}, "at most one subdivision", "012"),  # the plan may have left none
+        ({"plan.subdivision": "on"}, "one subdivision", "02"),
+        ({"plan.subdivision": "off"}, "no subdivision", "12"),
+        ({"train.subdivisions": "0"}, "no subdivision", "12"),
+    ],
+)
+def test_the_number_of_gaussians_is_turned_whatever_the_plan_says(words, own, others):
+    settings = job_from_words("smile", words).settings
+    levels = {knob.name: knob for knob in knobs_of(settings)}["number of Gaussians"].levels
+    assert levels[0].label == own and not levels[0].words
+    assert "".join(level.words["train.subdivisions"] for level in levels[1:]) == others
+    assert all(level.words["plan.subdivision"] == "on" for level in levels[1:])
+
+
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("20m", 1200), ("1.5h", 5400), ("45", 45)])
 def test_budgets(text, seconds):
     assert seconds_of(text) == seconds

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pipeline.body import load_body
+from pipeline.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.person import WINDOW
@@ -76,6 +77,36 @@ def test_a_head_calls_for_what_a_head_has(clip):
     assert not any(one.forced for one in plan.decisions)
     assert 180.0 in plan["auxiliary_views"].values and 0.0 not in plan["auxiliary_views"].values
     assert plan["face_registration"].measured == 5 and plan["pose_refinement"].measured == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "levels"), [(0.0, 0), (0.7, 0), (1.5, 0), (1.6, 1), (3.0, 1), (3.1, 2), (6.1, 3)]
+)
+def test_gaussians_are_as_fine_as_the_pixels(clip, monkeypatch, pixels, levels):
+    monkeypatch.setattr(decide, "gaussian_pixels", lambda clip: pixels)
+    made = planned(clip)["subdivision"]
+    assert made.on == (levels > 0) and made.values == (levels,) and made.measured == pixels
+
+
+def test_pixels_between_vertices_are_those_of_a_known_grid():
+    step = torch.arange(11) * 0.02  # metres
+    grid = torch.stack([*torch.meshgrid(step, step, indexing="xy"), torch.full((11, 11), -2.0)], -1)
+    corner = torch.arange(110).reshape(10, 11)[:, :10].flatten()
+    quads = torch.stack([corner, corner + 1, corner + 12, corner, corner + 12, corner + 11], 1)
+    faces = quads.reshape(-1, 3)  # round to the left seen from +Z, where the camera stands
+    camera = facing_camera(400, 400, 300.0)
+    assert measure._spacing(grid.reshape(-1, 3), faces, camera) == pytest.approx(300 * 0.02 / 2, rel=1e-5)
+    assert measure._spacing(grid.reshape(-1, 3), faces.flip(1), camera) == 0  # turned away
+    behind = grid.reshape(-1, 3) * torch.tensor([1.0, 1.0, -1.0])
+    assert measure._spacing(behind, faces, camera) == 0
+    assert measure._spacing(grid.reshape(-1, 3) + 5, faces, camera) == 0  # outside of the picture
+
+
+def test_a_picture_of_half_the_size_halves_the_pixels_between_vertices(clip):
+    whole = measure.read_clip(clip / "ingest", clip / "fit", measure_body())
+    half = {frame: one.resized(one.width // 2, one.height // 2) for frame, one in whole.cameras.items()}
+    ratio = measure.gaussian_pixels(whole) / measure.gaussian_pixels(dataclasses.replace(whole, cameras=half))
+    assert ratio == pytest.approx(2, rel=0.02)
 
 
 def test_equal_inputs_give_equal_bytes(clip):

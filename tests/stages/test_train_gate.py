@@ -8,10 +8,12 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
+from pipeline.plan import Decision, Plan
 from pipeline.records import read_json
 from pipeline.tables import read_table
 from stages.train import run as stage
 from stages.train.checkpoint import NAME
+from stages.train.costs import saved
 from stages.train.gate import PROBE, SCHEMA, Gate
 from stages.train.loop import Trainer
 from stages.train.obey import obey
@@ -222,14 +224,34 @@ def test_finished_avatar_shows_nothing_or_the_base_where_nothing_was_seen(subjec
     [
         ("pose_heads", "pose_heads_from", 1.0),
         ("pose_refinement", "refine_poses", False),
+        ("subdivision", "subdivisions", 0),
         ("face_loss", "face", 0.0),
         ("visibility_gate", "gate", False),
         ("face_residual", "residual_parts", ("left_hand", "right_hand")),
     ],
 )
 def test_training_builds_only_what_the_plan_names(effect, field, value):
-    assert getattr(obey(TINY, plan_of(**{effect: False})), field) == value
-    assert getattr(obey(TINY, plan_of()), field) == getattr(TINY, field)
+    wanted = dataclasses.replace(TINY, subdivisions=2)
+    assert getattr(obey(wanted, plan_of(**{effect: False})), field) == value
+    assert getattr(obey(wanted, plan_of()), field) == getattr(wanted, field)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "forced", "built"), [(2, False, 1), (1, False, 1), (0, False, 0), (2, True, 2)]
+)
+def test_the_mesh_is_no_finer_than_the_plan_says_unless_it_was_told_to(wanted, forced, built):
+    levels = Decision("subdivision", True, 2.0, 1.5, "pixels apart", "made up", forced, (1,))
+    others = [one for one in plan_of().decisions if one.effect != "subdivision"]
+    settings = dataclasses.replace(TINY, subdivisions=wanted)
+    assert obey(settings, Plan((*others, levels))).subdivisions == built
+
+
+def test_what_the_plan_left_out_of_the_mesh_is_said(subject, tmp_path):
+    trainer = trainer_for(context_for(subject, tmp_path / "out"))
+    wanted = dataclasses.replace(TINY, subdivisions=2)
+    count = len(trainer.avatar)
+    assert saved(trainer.avatar, count, wanted, TINY)["subdivision"] == {"gaussians": 15.0 * count}
+    assert "subdivision" not in saved(trainer.avatar, count, TINY, TINY)
 
 
 def test_without_pose_heads_there_are_none(subject, tmp_path):
