@@ -105,9 +105,12 @@ def crop(
     raster = rasterize(view, fine, surface.faces)
     marks = raster.interpolate(surface.faces.numpy(), carried.numpy())
     cut = mask[top:bottom, left:right].copy()
-    # What the clip never frames, a hand beside the hip of an upper body, is not the person's here.
-    cut[_outside(raster, marks[..., 1])] = 0
+    # What the clip never frames, a hand beside the hip of an upper body, is not the person's here; but nor
+    # is it empty: Gaussians at the border would learn the background's random colours, which are grey.
+    beyond = _outside(raster, marks[..., 1])
+    cut[beyond] = 0
     trust = _trust(raster, marks[..., 0], cut)
+    trust[beyond] = 0
     person = cut > 127
     news = float((trust[person] > 127).mean()) if person.any() else 0.0
     scale = min(1.0, framing.density * float(to_camera(view, fine)[:, 2].median() / view.intrinsics[0, 0]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import joint_index, read_poses, rest_joints, vertex_normals
+from pipeline.body import joint_index, pose_body, read_poses, rest_joints, vertex_normals
 from pipeline.camera import project
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_video
@@ -284,6 +284,17 @@ def test_a_head_is_cropped_out_of_the_whole_body(head, tmp_path):
     for row, frame in enumerate(poses.frames):
         place = project(cameras[frame], (hips + poses.transl[row])[None])[0]
         assert place[1] > cameras[frame].height, "the hips are below the picture"
+    # The body goes on where the clip never framed it: nothing is to be learnt there, not even that it is empty.
+    vertices, _ = pose_body(clip.body, clip.identity, poses.rotation, poses.expression, poses.transl)
+    beyond = 0
+    for row, frame in enumerate(poses.frames):
+        x, y = project(cameras[frame], vertices[row][shown == 0]).long().unbind(1)
+        inside = (x >= 0) & (x < cameras[frame].width) & (y >= 0) & (y < cameras[frame].height)
+        at = y[inside].numpy(), x[inside].numpy()
+        cut = read_mask(output / "masks", frame)[at] == 0
+        assert (read_mask(output / "trust", frame)[at][cut] < 128).mean() > 0.95
+        beyond += int(cut.sum())
+    assert beyond > 100
 
 
 def test_the_frontal_frame_is_the_reference(full):
