@@ -284,7 +284,7 @@ def test_a_head_is_cropped_out_of_the_whole_body(head, tmp_path):
     for row, frame in enumerate(poses.frames):
         place = project(cameras[frame], (hips + poses.transl[row])[None])[0]
         assert place[1] > cameras[frame].height, "the hips are below the picture"
-    # The body goes on where the clip never framed it: nothing is to be learnt there, not even that it is empty.
+    # The body goes on where the clip never framed it: nothing is learnt there, not even that it is empty.
     vertices, _ = pose_body(clip.body, clip.identity, poses.rotation, poses.expression, poses.transl)
     beyond = 0
     for row, frame in enumerate(poses.frames):
