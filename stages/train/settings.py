@@ -73,9 +73,9 @@ class TrainSettings:
     )
     skin_every: int = 100  # iterations between two looks at which vertex is nearest
     pose_heads_from: float = 0.4  # fraction of the run from which the pose heads take part; 1: never
-    # Pose and residual heads: what the frame saw when last drawn. A seventh of a step at 40,000 Gaussians,
-    # nothing at 10,000; what no frame sees then has the answers of heads that were never asked there.
-    pose_seen_only: bool = False
+    # Pose and residual heads: what the frame saw when last drawn. A tenth to a seventh of a step at 40,000
+    # Gaussians, nothing at 10,000; turned pictures and held-out frames are the same (docs/results.md).
+    pose_seen_only: bool = True
     # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
     pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices
     initial_color: bool = True  # colours start at what the training frames show, else at grey
