@@ -150,7 +150,7 @@ def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
     size = middle.new_tensor([camera.width, camera.height])
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
-    # Seen from outside a face's corners go round to the left; the picture's y axis points down, hence the sign.
+    # From outside a face's corners go round to the left; the picture's y axis points down, hence the sign.
     facing = area < 0
     seen = facing & ((middle > 0) & (middle < size)).all(1) & (depth[faces.long()] > 0).all(1)
     # A closed mesh has two faces a vertex.
