@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.body import rasterize
 from pipeline.body.mesh import Raster
 from pipeline.camera import Camera, project, to_camera
+from pipeline.records import spread
 from stages.auxiliary.texture import FineSurface
 from stages.auxiliary.turn import Clip
 
@@ -57,10 +58,7 @@ class Cropped:
 
 def find_framing(clip: Clip) -> Framing:
     """Look at some training frames of the clip."""
-    count = len(clip.train)
-    frames = (
-        [clip.train[k * count // LOOKED_AT] for k in range(LOOKED_AT)] if count > LOOKED_AT else clip.train
-    )
+    frames = spread(clip.train, LOOKED_AT)
     shown, densities = torch.zeros(len(clip.body.v_template)), []
     for frame in frames:
         camera, vertices = clip.cameras[frame], clip.vertices(frame)

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.body import load_landmarks
 from pipeline.errors import UserError
 from pipeline.plan import read_plan
+from pipeline.records import spread
 from stages.auxiliary import texture
 from stages.auxiliary.accept import accept_checked, accept_exact
 from stages.auxiliary.crop import find_framing
@@ -105,10 +106,3 @@ def offered(context: Context, generator: str, clip: Clip, turn: Turn) -> Offer:
     cameras = dict.fromkeys(turn.poses.frames, turn.camera)
     pictures = (Picture(frame, image) for frame, image in zip(turn.poses.frames, images, strict=True))
     return Offer(turn.poses, cameras, pictures)
-
-
-def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """At most ``count`` of the frames, evenly spread over them."""
-    if len(frames) <= count:
-        return frames
-    return tuple(frames[place * len(frames) // count] for place in range(count))

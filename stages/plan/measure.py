@@ -21,7 +21,7 @@ from pipeline.errors import UserError
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
 from pipeline.person import MARGIN, person_box
 from pipeline.plan import AZIMUTH_STEP
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split
+from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split, spread
 from pipeline.tables import read_table
 from pipeline.visibility import body_in_frame
 
@@ -127,10 +127,7 @@ def gaussian_pixels(clip: Clip) -> float:
     The root of the area that each has of what faces the camera within the person's box: the mean over
     ``LOOKED_AT`` training frames. 0 where none of them shows anything.
     """
-    train = clip.split.train
-    frames = (
-        [train[k * len(train) // LOOKED_AT] for k in range(LOOKED_AT)] if len(train) > LOOKED_AT else train
-    )
+    frames = spread(clip.split.train, LOOKED_AT)
     rows, poses = [clip.poses.index(frame) for frame in frames], clip.poses
     vertices, _ = pose_body(
         clip.body, clip.identity, poses.rotation[rows], poses.expression[rows], poses.transl[rows]

@@ -90,10 +90,3 @@ class Frames:
             return color, alpha
         rows, columns = slice(self.box.top, self.box.bottom), slice(self.box.left, self.box.right)
         return np.ascontiguousarray(color[rows, columns]), np.ascontiguousarray(alpha[rows, columns])
-
-
-def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """At most ``count`` of the frames, evenly spread over them."""
-    if len(frames) <= count:
-        return frames
-    return tuple(frames[position * len(frames) // count] for position in range(count))

@@ -19,14 +19,14 @@ from pipeline.frames import write_png
 from pipeline.metrics import Lpips
 from pipeline.person import person_box
 from pipeline.plan import read_plan
-from pipeline.records import Split, read_cameras, read_footage, read_split
+from pipeline.records import Split, read_cameras, read_footage, read_split, spread
 from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.clock import Clock
 from stages.train.costs import saved
-from stages.train.data import Frames, spread
+from stages.train.data import Frames
 from stages.train.divergence import WATCHED, require_progress
 from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
