@@ -31,7 +31,7 @@ from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.job import job_from_words
 from pipeline.metrics.image import psnr
 from pipeline.metrics.protocol import composite, interior
-from pipeline.study import made
+from pipeline.process import make_results
 
 SUBJECTS = ("mannequin_upper", "mannequin_head")
 BLEED, WOBBLE, SOFT = 2.5, 2.0, 1.5  # pixels: outwards, standard deviation of the edge, width of the edge
@@ -142,7 +142,7 @@ def judge(avatar: Avatar, ingest: Path, fit: Path) -> dict[str, float]:
 def try_way(subject: str, way: str, words: Mapping[str, str], folder: Path) -> Judgement:
     """Trains one way on one mannequin's worn masks, and judges it."""
     job = job_from_words(subject, {**words, **WAYS[way]})
-    truth, given, fit = made(job, ["ingest"])["ingest"].folder, folder / "ingest", folder / "fit"
+    truth, given, fit = make_results(job, ["ingest"])["ingest"].folder, folder / "ingest", folder / "fit"
     for place in (given, fit):
         place.mkdir(parents=True)
     for entry in truth.iterdir():
