@@ -125,7 +125,7 @@ def timings_section(results: Mapping[str, Result], seconds: float) -> Section:
     wall, cpu = (sum(times) / 60 for times in zip(*once.values(), strict=True))
     line = (
         f"The {len(once)} results that this stands on took {wall:,.0f} wall-clock minutes, {cpu:,.0f} "
-        f"minutes of processor time. This call took {seconds:,.0f} s: what the store held was not made again. "
+        f"minutes of processor time. This call took {seconds:,.0f} s: what the store held was not remade. "
         "Wall-clock seconds are those of the run that made a result, whatever else the machine was doing."
     )
     versions = list(versions_of(next(iter(done.values()))).items())

@@ -74,7 +74,10 @@ class World:
     """A base, store and clock where costs multiply and gains add up, as the search believes, or not quite."""
 
     def __init__(self, factors, gains, stored=(), surprise=0.0, failing=()):
-        self.factors, self.gains = dict(zip(LEVELS, factors, strict=True)), dict(zip(LEVELS, gains, strict=True))
+        self.factors, self.gains = (
+            dict(zip(LEVELS, factors, strict=True)),
+            dict(zip(LEVELS, gains, strict=True)),
+        )
         self.stored, self.surprise, self.failing = set(stored), surprise, failing
         self.now, self.made = 0.0, []
 
@@ -102,7 +105,9 @@ class World:
         return Result("ann", variant.name, seconds=seconds, cpu_seconds=seconds, means={"design": design})
 
     def search(self, budget, most=None):
-        found = Search(self, budget, lambda r: 30 + sum(map(self.gains.get, r.means["design"])), lambda: self.now)
+        found = Search(
+            self, budget, lambda r: 30 + sum(map(self.gains.get, r.means["design"])), lambda: self.now
+        )
         found.make(())
         found.make_affordable([(one,) for one in LEVELS][:most])
         if most is None:
