@@ -83,13 +83,20 @@ def scatter(
     ]
     if labels:
         adjust_text(
-            labels, points["x"].tolist(), points["y"].tolist(), ax=axes, iter_lim=200, ensure_inside_axes=True
+            labels,
+            points["x"].tolist(),
+            points["y"].tolist(),
+            ax=axes,
+            expand=(1.8, 1.9),
+            force_text=(0.3, 0.3),
+            iter_lim=300,
+            arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.6},
         )
     _save(figure, path)
 
 
 def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], across: str, up: str) -> None:
-    """Lines over a logarithmic axis; the first eight in colours with their names, the rest grey.
+    """Lines; the first eight in colours with their names, the rest grey.
 
     Args:
         path: the PNG.
@@ -110,7 +117,6 @@ def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], acros
         )
     if shown:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7.5)
-    _log_axis(axes, pd.Series([x for line in shown.values() for x, _ in line], dtype=float))
     _save(figure, path)
 
 
