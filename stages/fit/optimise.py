@@ -38,7 +38,7 @@ BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 
 
 Watch = Callable[[int, float, Callable[[], Parameters]], None]
-"""Called with the number of steps done, the loss before or after the last, and what gives the parameters."""
+"""Called with the number of steps done, the loss before the last, and what gives the parameters."""
 
 
 def ignore(step: int, loss: float, now: Callable[[], Parameters]) -> None:

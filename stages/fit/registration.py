@@ -23,12 +23,11 @@ from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
-from stages.fit.optimise import Watch, optimise
+from stages.fit.optimise import optimise
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
 from stages.fit.pose_start import initial_facing, initial_from_files
 from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
-from stages.fit.solver import STEPS, solve
 from stages.fit.views import Views, stack
 
 
@@ -55,7 +54,7 @@ class Registration:
     face_frames: int = 0
 
 
-@threads(1)  # sums of many threads differ in their last digits, also those before and after the solver
+@threads(1)  # sums of many threads differ in their last digits, also those before and after Adam
 def register(
     body: BodyModel,
     landmarks: Landmarks,
@@ -105,9 +104,10 @@ def register(
         face = Face(target, landmark_model(body, target.points, betas, spread))
     objective = Objective(body, observations, model, views, initial, movable, settings, face)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
-    recorder = Recorder(objective, steps_of(settings), report)
+    recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
-    fitted = _minimised(objective, initial, frozen, settings, recorder)
+    rate, size = settings.learning_rate, settings.minibatch
+    fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
     identity, poses = _outcome(objective, fitted, spread)
     error = objective.residuals(fitted)
     seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
@@ -125,16 +125,6 @@ def believed(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
     return keypoints
 
 
-def _minimised(
-    objective: Objective, initial: Parameters, frozen: frozenset[str], settings: FitSettings, watch: Watch
-) -> Parameters:
-    """The parameters that the chosen solver arrives at."""
-    if settings.solver == "lm" and settings.iterations > 0:
-        return solve(objective, initial, frozen, settings.minibatch, watch)
-    rate, size = settings.learning_rate, settings.minibatch
-    return optimise(objective, initial, settings.iterations, frozen, rate, size, watch)
-
-
 def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[Identity, Poses]:
     """Identity and poses; joints that nothing was seen of are where they began."""
     observations = objective.observations
@@ -144,11 +134,6 @@ def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[
         identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
     frames, measured = tuple(observations.frames.tolist()), observations.mask.any(1)
     return identity, Poses(frames, rotation, fitted.expression, fitted.transl, measured)
-
-
-def steps_of(settings: FitSettings) -> int:
-    """How many steps a fit takes at most: Adam as many as are set, the second-order solver its own number."""
-    return STEPS if settings.solver == "lm" and settings.iterations > 0 else settings.iterations
 
 
 def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:

@@ -30,7 +30,7 @@ from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
 from stages.fit.pose_given import given_poses, keep_given
-from stages.fit.registration import Registration, register, steps_of, views_of
+from stages.fit.registration import Registration, register, views_of
 from stages.fit.residuals import group_means, write_residuals
 from stages.fit.smoothing import smooth
 
@@ -81,7 +81,7 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         kept = keep_given(initial, body, views_of(keypoints, cameras))
         settings = dataclasses.replace(settings, iterations=0, face="off")
         context.log("publishes the poses that came with the footage as they are")
-    with context.progress(steps_of(settings), "registration") as progress:
+    with context.progress(settings.iterations, "registration") as progress:
 
         def report(note: str) -> None:
             progress.advance(1, note)

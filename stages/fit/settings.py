@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 FACE_SOURCES = ("auto", "mesh", "flame", "off")
-SOLVERS = ("adam", "lm")
 GIVEN = ("start", "keep", "ignore")
 
 
@@ -13,8 +12,7 @@ GIVEN = ("start", "keep", "ignore")
 class FitSettings:
     """Settings of the fit stage; lengths in metres, angles in radians."""
 
-    iterations: int = 200  # steps of adam over the whole clip, lm has its own; 0 publishes the initialisation
-    solver: str = "adam"  # how the objective is minimised: adam or lm
+    iterations: int = 200  # steps of Adam over the whole clip; 0 publishes the initialisation
     minibatch: int = 256  # frames posed at a time: memory does not grow with the clip
     learning_rate: float = 1.0  # factor on Adam's step of every group of parameters
 
@@ -51,7 +49,7 @@ class FitSettings:
             self._require(name, 0 <= getattr(self, name) < float("inf"), "be zero or more")
         for name in ("score_threshold", "overlay_opacity"):
             self._require(name, 0 <= getattr(self, name) <= 1, "lie between 0 and 1")
-        for name, words in (("face", FACE_SOURCES), ("solver", SOLVERS), ("given", GIVEN)):
+        for name, words in (("face", FACE_SOURCES), ("given", GIVEN)):
             self._require(name, getattr(self, name) in words, f"be one of {', '.join(words)}")
         window = self.smoothing_window
         self._require(
