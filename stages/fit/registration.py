@@ -17,16 +17,15 @@ from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from pipeline.threads import threads
-from stages.fit.doubt import without_doubted
+from stages.fit.adam import Recorder, optimise
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initial_poses import initial_facing, initial_from_files
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
-from stages.fit.optimise import optimise
+from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
-from stages.fit.pose_start import initial_facing, initial_from_files
-from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views, stack
 
@@ -81,7 +80,7 @@ def register(
         UserError: a frame has no camera, or there are no frames.
     """
     views = views_of(keypoints, cameras)
-    keypoints = believed(keypoints, log) if settings.masked else keypoints
+    keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
     observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
@@ -114,12 +113,12 @@ def register(
     return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
 
 
-def believed(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
-    """The detections without those of frames that are not believed, see ``doubt.py``."""
-    keypoints, doubted = without_doubted(keypoints)
-    if doubted:
+def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+    """The detections with outlier frames masked, see ``outlier_frames.py``; the log names these frames."""
+    keypoints, outliers = mask_outlier_frames(keypoints)
+    if outliers:
         log(
-            f"frame {', '.join(map(str, doubted))}: left and right are exchanged, or the points are nowhere "
+            f"frame {', '.join(map(str, outliers))}: left and right are exchanged, or the points are nowhere "
             "near those of the frames around; body and hands are not believed there"
         )
     return keypoints

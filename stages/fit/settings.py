@@ -1,4 +1,4 @@
-"""What can be set about the fit."""
+"""The settings of the fit stage."""
 
 from __future__ import annotations
 

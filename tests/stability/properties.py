@@ -23,9 +23,9 @@ from pipeline.metrics import composite, interior, psnr, ssim
 from pipeline.splat import Gaussians, render
 from pipeline.visibility import LARGEST_LOSS, authors_threshold, cost, evidence_threshold, histogram, otsu
 from stages.fit import terms
-from stages.fit.doubt import exchanged, nonsense
 from stages.fit.initialise import continuous
 from stages.fit.observations import drop_guesses, visible
+from stages.fit.outlier_frames import isolated_outliers, left_right_swapped
 from stages.fit.parameters import orthonormalised
 from stages.fit.smoothing import nearest_branch, smooth
 from stages.fit.windows import bumps, windows
@@ -333,12 +333,12 @@ def guesses_are_only_taken_away(mask):
         )
     )
 )
-def doubt_never_takes_most_of_a_clip(clip):
+def outlier_frames_are_never_most_of_a_clip(clip):
     left, right, gaps = clip
     frames = np.cumsum(gaps).astype(np.int64)
-    rows = exchanged(frames, left, right)
+    rows = left_right_swapped(frames, left, right)
     assert len(rows) <= len(frames) / 2 and (np.diff(rows) > 0).all()
-    assert set(nonsense(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
+    assert set(isolated_outliers(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
 
 
 # Masks, splits and draws

@@ -13,9 +13,9 @@ from pipeline.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.guard import NotFiniteError
 from pipeline.keypoints import empty_keypoints
-from stages.fit.doubt import BODY_PAIRS, without_doubted
+from stages.fit.adam import optimise
 from stages.fit.objective import Objective
-from stages.fit.optimise import optimise
+from stages.fit.outlier_frames import BODY_PAIRS, mask_outlier_frames
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
 from stages.fit.smoothing import smooth
@@ -179,7 +179,7 @@ def test_any_focal_length_has_a_finite_fit_before_the_camera(model, clip, focal)
     ],
 )
 def test_one_wrong_frame_does_not_move_the_body_in_any(model, change):
-    """One frame in eight: before such frames were doubted 140 degrees off, and 60 in all the others."""
+    """One frame in eight: before such frames were masked 140 degrees off, and 60 in all the others."""
     clip, said = make_clip(*model, count=8), []
     hard = changed(clip, change)
     settings = FitSettings(iterations=50)
@@ -191,7 +191,7 @@ def test_one_wrong_frame_does_not_move_the_body_in_any(model, change):
     assert (fitted.poses.transl - clip.poses.transl).norm(dim=1).max() < 0.05
 
 
-def test_a_stretch_of_exchanged_frames_is_doubted_and_what_turns_round_is_not(model):
+def test_a_stretch_of_swapped_frames_is_masked_and_what_turns_round_is_not(model):
     """Up to five frames; somebody who is seen from behind from then on has turned round."""
     clip = make_clip(*model, count=16)
 
@@ -199,7 +199,7 @@ def test_a_stretch_of_exchanged_frames_is_doubted_and_what_turns_round_is_not(mo
         def change(image, world):
             image[rows], world[rows] = image[rows][:, LEFT_RIGHT], world[rows][:, LEFT_RIGHT]
 
-        return without_doubted(changed(clip, change).keypoints)[1]
+        return mask_outlier_frames(changed(clip, change).keypoints)[1]
 
     assert exchanged(slice(0, 0)) == []
     assert exchanged(slice(4, 8)) == [7, 8, 9, 10]  # the clip's first frame is number 3
@@ -211,17 +211,17 @@ def test_a_stretch_of_exchanged_frames_is_doubted_and_what_turns_round_is_not(mo
     def turned(image, world):
         image[4], world[4] = image[4, LEFT_RIGHT], world[4, LEFT_RIGHT]
 
-    assert without_doubted(changed(sparse, turned).keypoints)[1] == []
+    assert mask_outlier_frames(changed(sparse, turned).keypoints)[1] == []
 
 
-def test_what_an_estimator_of_133_points_exchanges_is_doubted_too(model):
+def test_what_an_estimator_of_133_points_swaps_is_masked_too(model):
     clip = whole_body(make_clip(*model, count=8), *model)
-    assert without_doubted(clip.keypoints)[1] == []
+    assert mask_outlier_frames(clip.keypoints)[1] == []
     points = clip.keypoints.whole_body.copy()
     pairs = [row for pair in BODY_PAIRS for row in pair]
     points[3, pairs] = points[3, [row for left, right in BODY_PAIRS for row in (right, left)]]
-    keypoints, doubted = without_doubted(dataclasses.replace(clip.keypoints, whole_body=points))
-    assert doubted == [6] and not keypoints.whole_body[3, 5:17, 2].any()
+    keypoints, outliers = mask_outlier_frames(dataclasses.replace(clip.keypoints, whole_body=points))
+    assert outliers == [6] and not keypoints.whole_body[3, 5:17, 2].any()
 
 
 def test_a_person_who_leaves_and_returns_is_where_the_frames_around_say(model):

@@ -17,7 +17,7 @@ from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask
 from pipeline.keypoints import write_keypoints
 from pipeline.records import Footage, write_cameras, write_footage
-from stages.fit.optimise import optimise
+from stages.fit.adam import optimise
 from stages.fit.registration import register
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
