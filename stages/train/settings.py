@@ -12,8 +12,6 @@ NETWORKS = ("alex", "vgg")
 PLACES = ("canonical", "posed")
 SKINNINGS = ("own", "nearest")
 DEVICES = ("auto", "cpu", "cuda")
-DEFINITIONS = ("in_frame", "contributes")
-GUARDS = ("evidence", "authors")
 UNSEEN = ("nothing", "base", "generated")
 PARTS = (
     "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg",
@@ -96,9 +94,7 @@ class TrainSettings:
     early_gate: bool = True  # from the start: what lies in no training frame's picture
     gate_from: float = 0.1  # fraction of the run, the warm-up, after which scores are looked at; 1: never
     gate_every: int = 50  # iterations between looks
-    gate_definition: str = "in_frame"  # what counts as seen: in_frame, or contributes to the rendering
     gate_threshold: float | None = None  # scores below are gated; none: found in the scores (Otsu)
-    gate_guard: str = "evidence"  # when Otsu is believed: evidence, or as in the authors' release: authors
     gate_rings: int = 2  # rings of neighbours added to what is left
     # What a finished avatar shows where no captured frame showed enough: nothing, base (the fitted body in
     # the colours next to it), or generated (what generated frames show, and nothing where there are none)
@@ -164,10 +160,7 @@ class TrainSettings:
             ("residual_width",), lambda value: value % self.groups == 0, "be divisible by train.groups"
         )
         self._require(("lpips_network",), lambda value: value in NETWORKS, f"be one of {', '.join(NETWORKS)}")
-        words = {
-            "residual_place": PLACES, "gate_definition": DEFINITIONS, "gate_guard": GUARDS, "unseen": UNSEEN,
-            "device": DEVICES,
-        }  # fmt: skip
+        words = {"residual_place": PLACES, "unseen": UNSEEN, "device": DEVICES}
         for name, known in words.items():
             self._require((name,), known.__contains__, f"be one of {', '.join(known)}")
         if self.gate_threshold is not None:
