@@ -13,7 +13,6 @@ from pipeline.records import read_json
 from pipeline.tables import read_table
 from stages.train import run as stage
 from stages.train.checkpoint import NAME
-from stages.train.costs import saved
 from stages.train.gate import SCHEMA, Gate
 from stages.train.loop import Trainer
 from stages.train.obey import obey
@@ -230,14 +229,6 @@ def test_the_mesh_is_no_finer_than_the_plan_says_unless_it_was_told_to(wanted, f
     others = [one for one in plan_of().decisions if one.effect != "subdivision"]
     settings = dataclasses.replace(TINY, subdivisions=wanted)
     assert obey(settings, Plan((*others, levels))).subdivisions == built
-
-
-def test_what_the_plan_left_out_of_the_mesh_is_said(subject, tmp_path):
-    trainer = trainer_for(context_for(subject, tmp_path / "out"))
-    wanted = dataclasses.replace(TINY, subdivisions=2)
-    count = len(trainer.avatar)
-    assert saved(trainer.avatar, count, wanted, TINY)["subdivision"] == {"gaussians": 15.0 * count}
-    assert "subdivision" not in saved(trainer.avatar, count, TINY, TINY)
 
 
 def test_without_pose_heads_there_are_none(subject, tmp_path):
