@@ -174,8 +174,6 @@ class Objective:
         settings = self.settings
         image = losses.over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
-        if settings.mask_band:
-            image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
         if view.trust is not None:
             image = losses.believed(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)

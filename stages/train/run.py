@@ -172,7 +172,7 @@ def prepare(
     if settings.initial_color or settings.face:
         chosen = spread(inputs.split.train, settings.color_frames)
         made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
-        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
+        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)

@@ -29,7 +29,7 @@ FRACTIONS = (
 AMOUNTS = (
     "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "plane_learning_rate",
     "pose_learning_rate", "offset_unit", "pose_offset_unit", "seed", "pose_noise",
-    "threads", "place_frequencies", "time_frequencies", "lpips_crop", "mask_band", "l1", "ssim", "lpips",
+    "threads", "place_frequencies", "time_frequencies", "lpips_crop", "l1", "ssim", "lpips",
     "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
     "laplacian_scale_face", "laplacian_color", "laplacian_color_hands", "offset", "offset_hands",
     "offset_face", "pose_offset", "hand_normal", "scale_size", "scale_size_hands", "scale_growth",
@@ -120,7 +120,6 @@ class TrainSettings:
     face: float = 0.0  # lambda_face; the paper's is 0.8
     generated_every: int = 5  # draws for one of a generated frame; the paper's is 2, equally often
     generated: float = 0.1  # lambda_L1, lambda_ssim and lambda_lpips on generated frames
-    mask_band: int = 0  # pixels on either side of the silhouette where the mask is in doubt; 0: believed
 
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: float = 1e3  # smoothness of static and of all offsets together

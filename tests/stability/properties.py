@@ -241,12 +241,6 @@ def image_losses_are_finite_with_finite_slopes(pair):
     assert leaf.grad.isfinite().all()
 
 
-@property_of(arrays(9, 7, low=0.0, high=1.0), st.integers(0, 4))
-def trust_is_a_share(alpha, band):
-    found = losses.trust(tensor(alpha), band)
-    assert found.min() >= -1e-6 and found.max() <= 1 + 1e-6
-
-
 @property_of(arrays(9, 7, low=0.0, high=1.0), st.integers(0, 40), st.floats(0, 1, exclude_max=True))
 def a_crop_lies_in_the_picture(alpha, side, share):
     rows, columns = crop(tensor(alpha), side, share)
