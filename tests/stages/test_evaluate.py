@@ -22,7 +22,7 @@ from stages.evaluate.run import evaluate, report_place
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import show_summary
-from stages.train.gate import SCHEMA as VISIBILITY
+from stages.train.visibility_gate import SCHEMA as VISIBILITY
 from tests.stages.evaluate_subject import (
     FRAMES,
     HEIGHT,
