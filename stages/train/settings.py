@@ -1,4 +1,4 @@
-"""What can be set about training. The defaults are the ``quick`` preset's values."""
+"""Settings of training. The defaults are the ``quick`` preset's values."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class TrainSettings:
     # Noise on what the pose heads are told of the pose: without it they learn each frame by heart.
     pose_noise: float = 0.05  # standard deviation of each entry of the joints' rotation matrices
     initial_color: bool = True  # colours start at what the training frames show, else at grey
-    color_frames: int = 24  # training frames that first colours are looked for in
+    color_frames: int = 24  # training frames that initial colours are taken from
 
     # Residual colours (Section 3.5). A part that the plan does not name gets no head.
     residual_parts: tuple[str, ...] = ("face", "left_hand", "right_hand")  # "rest": the authors' fourth net
