@@ -27,8 +27,9 @@ from torch import Tensor
 from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
 from pipeline.avatar import Avatar
+from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.metrics.image import psnr
 from pipeline.metrics.protocol import composite, interior
 from pipeline.study import made
@@ -141,7 +142,7 @@ def judge(avatar: Avatar, ingest: Path, fit: Path) -> dict[str, float]:
 
 def try_way(subject: str, way: str, words: Mapping[str, str], folder: Path) -> Judgement:
     """Trains one way on one mannequin's worn masks, and judges it."""
-    job = job_from_words(subject, {**words, **WAYS[way]})
+    job = open_job(subject, parse_request({**words, **WAYS[way]}, subject))
     truth, given, fit = made(job, ["ingest"])["ingest"].folder, folder / "ingest", folder / "fit"
     for place in (given, fit):
         place.mkdir(parents=True)
