@@ -45,7 +45,7 @@ from pipeline.threads import threads
 from stages.fit.face_offset import spread_matrix
 from stages.fit.parameters import Parameters, landmark_model, parameters_of
 from stages.fit.registration import register
-from stages.fit.settings import SOLVERS, FitSettings
+from stages.fit.settings import FitSettings
 from stages.fit.solver import STEPS
 from stages.ingest.mannequin import FRAMINGS, MannequinSpec
 
@@ -207,7 +207,7 @@ def _effort_table(
     names = ", ".join(clip.spec.framing for clip in clips)
     yield f"\neffort, {clips[0].detector} keypoints, mean of one clip each of {names}"
     yield _row("", *COLUMNS, "s/100 fr.")
-    for solver in SOLVERS:
+    for solver in ("adam", "lm"):
         # The second-order solver takes its own number of steps, whatever is set.
         for iterations in efforts if solver == "adam" else (STEPS,):
             settings = dataclasses.replace(FitSettings(), iterations=iterations, solver=solver)

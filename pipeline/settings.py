@@ -239,7 +239,7 @@ def help_lines(kind: type, stage: str) -> list[str]:
     lines = []
     for name, schema in schemas(kind).items():
         default = schema["default"]
-        text = ",".join(default) if isinstance(default, list) else str(default)
+        text = ",".join(map(str, default)) if isinstance(default, list) else str(default)
         text = text.lower() if default is None or isinstance(default, bool) else text
         lines.append(f"{stage}.{name}={text}: {describe(schema)}; {schema['description']}")
     return lines
