@@ -22,8 +22,9 @@ import numpy as np
 
 from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
+from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, write_png
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.metrics import Lpips
 from pipeline.study import made
 from stages.evaluate.scoring import Scorer
@@ -95,7 +96,7 @@ Table = dict[str, dict[str, Numbers]]
 
 def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
     """Trains one variant on one subject and scores it."""
-    job = job_from_words(subject, words)
+    job = open_job(subject, parse_request(words, subject))
     folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
     scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})

@@ -27,8 +27,9 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
+from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
@@ -78,7 +79,7 @@ def open_subject(name: str) -> Subject:
     Raises:
         UserError: the store has no plan of it under the present settings.
     """
-    job = job_from_words(name, {})
+    job = open_job(name, parse_request({}, name))
     folders = {}
     for stage in ("ingest", "fit", "plan"):
         artifact = job.find(stage)

@@ -19,7 +19,6 @@ from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import drop_guesses, observe, visible
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.registration import views_of
-from stages.fit.settings import FitSettings
 from stages.fit.windows import bumps
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
 
@@ -289,11 +288,3 @@ def test_rate_is_coarse_to_fine():
 def test_loss_that_is_not_finite_is_named():
     with pytest.raises(NotFiniteError, match="step 7: smooth"):
         finite_sum({"keypoints": torch.ones(()), "smooth": torch.tensor(math.nan)}, 7)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("iterations", -1), ("betas", 0), ("smoothness", -1.0), ("score_threshold", 1.5)]
-)
-def test_settings_refuse_what_cannot_work(name, value):
-    with pytest.raises(ValueError, match=f"fit.{name} must"):
-        FitSettings(**{name: value})
