@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.artifact import MANIFEST
+from pipeline.config.request import Request
 from pipeline.errors import UserError
 from pipeline.settings import read_toml
 from pipeline.stage import Progress
@@ -24,8 +25,7 @@ from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import bars
 from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section
 from pipeline.studies.tables import HERE, MAIN, MEAN, NOTE, PAPER, Column, Table
-from pipeline.studies.variants import Base, Overrides, Result, Variant, base_of, scale_overrides, study_folder
-from pipeline.workspace import Workspace
+from pipeline.studies.variants import Base, Result, Variant, base_of, scale_overrides, study_folder
 
 FULL, CHANCE, CHANCE_LABEL = "full", "chance", "another seed"
 FIXED = 0.4  # the paper's threshold by hand
@@ -109,36 +109,33 @@ class Ablation:
         return differences.mean()
 
 
-def ablate(name: str, subjects: Sequence[str], words: Overrides) -> Path:
+def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     """Runs every variant of the subjects and writes tables, plots and page.
 
     Args:
         name: of the study: a subject, or a dataset.
         subjects: whose avatars.
-        words: the command line's.
+        request: the command line's.
 
     Returns:
         The study's folder.
 
     Raises:
-        UserError: a word is wrong, or nothing at all could be made.
+        UserError: a setting is wrong, or nothing at all could be made.
     """
-    scale_overrides(words)  # refused before anything is made
-    start = time.monotonic()
-    workspace, folder = study_folder(words, "ablate", name)
-    bases, results = run_all(subjects, words, folder / "log.txt")
+    scale_overrides(request)  # refused before anything is made
+    start, folder = time.monotonic(), study_folder(request, "ablate", name)
+    bases, results = run_all(subjects, request, folder / "log.txt")
     if all(result.failure for result in results.values()):
         raise UserError(next(iter(results.values())).failure)
     refined = all(counts_refined(base) for base in bases.values())
-    ablation = Ablation(
-        results, scores_of(bases, results, refined), dataset_of(workspace, subjects, words), refined
-    )
+    ablation = Ablation(results, scores_of(bases, results, refined), dataset_of(subjects, request), refined)
     write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
     return folder
 
 
 def run_all(
-    subjects: Sequence[str], words: Overrides, log: Path
+    subjects: Sequence[str], request: Request, log: Path
 ) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
     """Every variant of every subject, a subject after the other; and the bases that could be read."""
     bases, results = {}, {}
@@ -146,7 +143,7 @@ def run_all(
     try:
         for subject in subjects:
             try:
-                bases[subject] = base_of(subject, words, log, {"auxiliary.generator": "auto"})
+                bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in (*VARIANTS, CHANCE)}
                 progress.advance(len(VARIANTS) + 1, subject)
@@ -166,11 +163,11 @@ def variants_of(base: Base) -> dict[str, Variant]:
     return {**VARIANTS, CHANCE: Variant(CHANCE_LABEL, {"train.seed": str(seed)})}
 
 
-def dataset_of(workspace: Workspace, subjects: Sequence[str], words: Overrides) -> str:
+def dataset_of(subjects: Sequence[str], request: Request) -> str:
     """The dataset that all subjects belong to; empty if none."""
-    files = [workspace.data / "subjects" / f"{subject}.toml" for subject in subjects]
+    files = [request.workspace.data / "subjects" / f"{subject}.toml" for subject in subjects]
     names = {str(read_toml(file).get("dataset", "")) if file.is_file() else "" for file in files}
-    return words.get("dataset", names.pop() if len(names) == 1 else "")
+    return request.dataset or (names.pop() if len(names) == 1 else "")
 
 
 def counts_refined(base: Base) -> bool:

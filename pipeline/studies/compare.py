@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import Any
 import pandas as pd
 
 from pipeline.artifact import Artifact, Store
+from pipeline.config.request import Request
 from pipeline.datasets import Dataset, load_dataset, subjects_of
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
-from pipeline.job import job_from_words, shown, workspace_from_words
+from pipeline.job import open_job, shown
 from pipeline.protocols import ON, OWN, Protocol, chosen
 from pipeline.stage import usual
 from pipeline.studies.tables import pipe_table
@@ -32,16 +34,16 @@ Summary = Mapping[str, Any]
 ``current``, made under these settings."""
 
 
-def compare(dataset: str, words: Mapping[str, str]) -> Path:
+def compare(dataset: str, request: Request) -> Path:
     """Prints the table of a dataset and writes it to ``artifacts/compare/<dataset>.md``.
 
     Raises:
         UserError: there is no such dataset, or a result of it is damaged.
     """
-    workspace = workspace_from_words(words)
+    workspace = request.workspace
     about, subjects = load_dataset(workspace, dataset), subjects_of(workspace, dataset)
-    words = {name: value for name, value in words.items() if name not in ("dataset", "subject", "source")}
-    summaries = {subject: summary_of(subject, words) for subject in subjects}
+    request = dataclasses.replace(request, subjects=())  # each is what its own file says
+    summaries = {subject: summary_of(subject, request) for subject in subjects}
     found = {subject: one for subject, one in summaries.items() if one}
     text = comparison(about, subjects, found)
     path = workspace.artifacts / "compare" / f"{dataset}.md"
@@ -50,9 +52,9 @@ def compare(dataset: str, words: Mapping[str, str]) -> Path:
     return path
 
 
-def summary_of(subject: str, words: Mapping[str, str]) -> Summary | None:
-    """A subject's result under these words, else the one in use, else None."""
-    job = job_from_words(subject, words)
+def summary_of(subject: str, request: Request) -> Summary | None:
+    """A subject's result that is asked for, else the one in use, else None."""
+    job = open_job(subject, request)
     last = "evaluate" if "evaluate" in job.stages else usual(job.stages)[-1]
     try:
         current = job.find(last)
@@ -158,5 +160,5 @@ def remarks(about: Dataset, subjects: Sequence[str], found: Mapping[str, Summary
         said.append(f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}")
     other = [subject for subject, one in found.items() if not one["current"]]
     if other:
-        said.append(f"Under other settings than these words would give: {', '.join(other)}")
+        said.append(f"Under other settings than are asked for: {', '.join(other)}")
     return said

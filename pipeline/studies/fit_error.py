@@ -45,7 +45,7 @@ def fit_numbers(base: Base, result: Result) -> dict[str, float | str]:
         "seconds": timings.get("registration_seconds", math.nan) if processor is None else processor,
         "clock": "wall-clock" if processor is None else "processor",
         "pixels": pixels[-1][1] if pixels else math.nan,
-        "millimetres": truth_error(ingest, fit, base.job().workspace.body_file),
+        "millimetres": truth_error(ingest, fit, base.request.workspace.body_file),
     }
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pipeline.config.request import Request
 from pipeline.curves import read_curve
 from pipeline.errors import UserError
 from pipeline.job import Job
@@ -40,8 +41,7 @@ from pipeline.studies.sweep import (
     sweep_levels,
 )
 from pipeline.studies.tables import MAIN, NOTE, Column, Table
-from pipeline.studies.variants import Base, Overrides, Result, Variant, base_of, run_record, study_folder
-from pipeline.workspace import Workspace
+from pipeline.studies.variants import Base, Result, Variant, base_of, run_record, study_folder
 
 DEFAULT_BUDGET = "20m"
 COLUMNS = (
@@ -103,18 +103,18 @@ class Tradeoff:
         return list(frontier(self.choices[cost], sign * self.choices[metric]))
 
 
-def tradeoff(subject: str, words: Overrides) -> Path:
+def tradeoff(subject: str, request: Request) -> Path:
     """Explores one subject's settings and writes table, plots and page.
 
     Returns:
         The study's folder.
 
     Raises:
-        UserError: a word is wrong, or the base itself failed.
+        UserError: a setting is wrong, or the base itself failed.
     """
-    text = words.get("budget", DEFAULT_BUDGET)
-    budget, (workspace, folder) = seconds_of(text), study_folder(words, "tradeoff", subject)
-    base = base_of(subject, words, folder / "log.txt")
+    text = request.budget or DEFAULT_BUDGET
+    budget, folder = seconds_of(text), study_folder(request, "tradeoff", subject)
+    base = base_of(subject, request, folder / "log.txt")
     levels = sweep_levels(base.settings)
     print(f"tradeoff of {subject}: {len(levels)} levels alone, then what combines, within {text}", flush=True)
     meters: list[AvatarMeter] = []
@@ -130,7 +130,7 @@ def tradeoff(subject: str, words: Overrides) -> Path:
         raise UserError(own.failure)
     fits = run_fits(search)
     search.make_affordable((level,) for level in levels)
-    presets, expected = run_presets(search, levels, workspace)
+    presets, expected = run_presets(search, levels)
     search.make_affordable(combinations(search.alone(), search.noise))
 
     runs = [(result, design, "" if design else base.preset) for design, result in search.results.items()]
@@ -162,13 +162,11 @@ def run_fits(search: Search) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def run_presets(
-    search: Search, levels: Sequence[Level], workspace: Workspace
-) -> tuple[dict[str, Result], dict[str, float]]:
+def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Result], dict[str, float]]:
     """The presets that the store holds or half of the budget's rest reaches; the others' expected cost."""
     own = search.results[()]
     results, expected = {}, {}
-    for path in sorted((workspace.data / "presets").glob("*.toml")):
+    for path in sorted((search.base.request.workspace.data / "presets").glob("*.toml")):
         base = search.base.under_preset(path.stem)
         expected[path.stem] = expected_cost(search, base.job(), levels)
         seconds = expected[path.stem] * sum(own.seconds.values()) / max(training_cost(own), 1e-9)

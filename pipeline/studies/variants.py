@@ -16,22 +16,21 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifact import RUN
+from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.job import DEFAULT_PRESET, Found, Job, job_from_words, workspace_from_words
+from pipeline.job import Found, Job, open_job
 from pipeline.process import make_results
-from pipeline.workspace import Workspace
 
 Overrides = Mapping[str, str]
 """Setting's name -> text, as on the command line."""
 
 SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
-NO_OVERRIDES = ("subject", "dataset", "budget", "scale")  # words of the command line that are the study's own
 
 SCALES: Mapping[str, Overrides] = {
     "preset": {},
     "small": {"train.iterations": "200", "train.subdivisions": "0"},
 }
-"""``scale=`` -> its overrides; any other word of the command line wins over them."""
+"""``scale=`` -> its overrides; those of the command line win over them."""
 
 LEAN = {
     "turntable_frames": "2",
@@ -100,23 +99,23 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class Base:
-    """One subject's settings that a study's variants override, and where its stages write their lines.
+    """One subject's request that a study's variants override, and where its stages write their lines.
 
     Attributes:
         subject: whose avatar.
-        overrides: of the stages' settings and places, as on the command line.
+        request: the study's own settings and places.
         log: a file for the stages' lines.
         preset: the preset that the base is, unchanged; empty where settings differ from one.
     """
 
     subject: str
-    overrides: Overrides
+    request: Request
     log: Path
     preset: str = ""
 
     def job(self, overrides: Overrides | None = None) -> Job:
         """The job of a variant; UserError where a setting is wrong."""
-        return job_from_words(self.subject, {**self.overrides, **(overrides or {})})
+        return open_job(self.subject, self.request.override(overrides or {}))
 
     @functools.cached_property
     def settings(self) -> Mapping[str, Any]:
@@ -144,53 +143,45 @@ class Base:
 
     def under_preset(self, preset: str) -> Base:
         """The same subject and places under a preset's own settings."""
-        places = {name: text for name, text in self.overrides.items() if "." not in name}
-        return Base(self.subject, {**places, "preset": preset}, self.log, preset)
+        request = dataclasses.replace(self.request, preset=preset, overrides={})
+        return Base(self.subject, request, self.log, preset)
 
 
-def base_of(subject: str, words: Overrides, log: Path, defaults: Overrides | None = None) -> Base:
-    """A study's base: the command line, on top of ``scale=``, a lean evaluate and a curve of ten points.
+def base_of(subject: str, request: Request, log: Path, defaults: Overrides | None = None) -> Base:
+    """A study's base: the request, on top of its scale, a lean evaluate and a curve of ten points.
 
     Args:
         subject: whose avatar.
-        words: the command line.
+        request: the command line's.
         log: a file for the stages' lines.
         defaults: overrides that everything else wins over.
 
     Raises:
-        UserError: a word is wrong.
+        UserError: a setting or the scale is wrong.
     """
-    scaled, own = scale_overrides(words), stage_overrides(words)
-    settings = job_from_words(subject, {**scaled, **own}).settings
+    own = {**scale_overrides(request), **request.overrides}
+    settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
     if hasattr(train, "held_out_every"):
         lean["train.held_out_every"] = str(min(train.held_out_every, max(1, train.iterations // 10)))
-    changed = [name for name in own if "." in name and not name.startswith("evaluate.")]
-    preset = "" if changed or scaled else words.get("preset", DEFAULT_PRESET)
-    return Base(subject, {**(defaults or {}), **lean, **scaled, **own}, log, preset)
+    changed = any(not name.startswith("evaluate.") for name in own)
+    full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
+    return Base(subject, full, log, "" if changed else request.preset)
 
 
-def stage_overrides(words: Overrides) -> dict[str, str]:
-    """The command line without the study's own words; ``dataset=`` stays where ``subject=`` is named too."""
-    own = {name: value for name, value in words.items() if name not in NO_OVERRIDES}
-    return {**own, "dataset": words["dataset"]} if {"subject", "dataset"} <= set(words) else own
-
-
-def scale_overrides(words: Overrides) -> Overrides:
+def scale_overrides(request: Request) -> Overrides:
     """The overrides that ``scale=`` stands for; UserError where there is no such scale."""
-    scale = words.get("scale", "preset")
-    if scale not in SCALES:
-        raise UserError(f"scale={scale}: there is no such scale; there are {', '.join(SCALES)}")
-    return SCALES[scale]
+    if request.scale not in SCALES:
+        raise UserError(f"scale={request.scale}: there is no such scale; there are {', '.join(SCALES)}")
+    return SCALES[request.scale]
 
 
-def study_folder(words: Overrides, kind: str, name: str) -> tuple[Workspace, Path]:
-    """The workspace, and the folder for a study's tables, plots and page; it is made."""
-    workspace = workspace_from_words(words)
-    folder = workspace.data / "studies" / kind / name
+def study_folder(request: Request, kind: str, name: str) -> Path:
+    """The folder for a study's tables, plots and page; it is made."""
+    folder = request.workspace.data / "studies" / kind / name
     folder.mkdir(parents=True, exist_ok=True)
-    return workspace, folder
+    return folder
 
 
 def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Result:

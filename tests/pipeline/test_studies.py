@@ -9,12 +9,14 @@ import time
 import pytest
 
 from pipeline.artifact import Store
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import job_from_words
+from pipeline.job import open_job
+from pipeline.studies.ablation import FULL, variants_of
 from pipeline.studies.measure import MeasurementCache
 from pipeline.studies.search import seconds_of
 from pipeline.studies.sweep import CHANCE, sweep_levels
-from pipeline.studies.variants import Base, Variant, base_of
+from pipeline.studies.variants import LEAN, Base, Variant, base_of
 from pipeline.workspace import REPOSITORY
 
 VARIANTS = (
@@ -29,7 +31,7 @@ def words_of(toy, **more):
 
 
 def run(toy, variants=VARIANTS):
-    base = Base("ann", words_of(toy), toy.root / "log.txt")
+    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
     return [base.run(variant) for variant in variants]
 
 
@@ -45,7 +47,7 @@ def test_what_variants_share_is_made_once_and_never_again(toy):
 
 
 def test_what_is_missing_of_a_variant_is_known_before_it_is_made(toy):
-    base = Base("ann", words_of(toy), toy.root / "log.txt")
+    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
     assert base.missing("paint", {}) == ["gather", "bend", "paint"]
     base.run(VARIANTS[0], ["bend"])
     assert base.missing("paint", {}) == ["paint"] and base.missing("bend", {}) == []
@@ -75,10 +77,11 @@ def test_what_was_in_use_stays_in_use(toy):
 STUDY = """
 import sys
 from pathlib import Path
+from pipeline.config.request import parse_request
 from pipeline.studies.variants import Base, Variant
 data, log = sys.argv[1:]
 words = {"data": data, "stages": "tests.pipeline.toy_stages", "paint.iterations": "40", "paint.rate": "0.05"}
-base = Base("ann", words, Path(log))
+base = Base("ann", parse_request(words), Path(log))
 assert not any(base.run(one).failure for one in (Variant("one"), Variant("two", {"bend.angle": "2"})))
 """
 
@@ -105,37 +108,36 @@ def test_a_study_killed_outright_goes_on_where_it_was(toy):
 
 def test_a_base_is_the_command_line_on_top_of_its_scale(toy):
     def own(subject, words):
-        return base_of(subject, words, toy.root / "log.txt").overrides
+        return base_of(subject, parse_request(words), toy.root / "log.txt").request.overrides
 
     words = {"subject": "smile", "budget": "3m", "scale": "small", "train.subdivisions": "1"}
     found = own("smile", words)
     assert found["train.subdivisions"] == "1" and found["train.iterations"] == "200"
     assert 200 // int(found["train.held_out_every"]) >= 5 and found["evaluate.turntable_frames"] == "2"
-    assert not {"subject", "budget", "scale"} & set(found)
+    assert {f"evaluate.{name}" for name in LEAN} <= set(found)
     assert own("smile", {**words, "evaluate.turntable_frames": "9"})["evaluate.turntable_frames"] == "9"
-    assert own("ann", words_of(toy)) == words_of(toy)  # stages without such settings
-    assert "dataset" not in own("smile", {"dataset": "samples"})
-    assert own("smile", {"subject": "smile", "dataset": "samples"})["dataset"] == "samples"
+    assert own("ann", words_of(toy)) == {}  # stages without such settings
     with pytest.raises(UserError, match="scale=huge"):
         own("smile", {"scale": "huge"})
 
 
 def test_a_base_knows_the_preset_that_it_is_and_takes_another(toy):
     def base(**words):
-        return base_of("smile", words, toy.root / "log.txt")
+        return base_of("smile", parse_request(words), toy.root / "log.txt")
 
     assert base().preset == "quick" and base(preset="draft").preset == "draft"
     assert base(**{"evaluate.turntable_frames": "9"}).preset == "quick"
     assert base(scale="small").preset == base(**{"train.lpips": "0"}).preset == ""
-    other = base(**{"train.iterations": "7", "body": "data/body"}).under_preset("paper")
-    assert other.settings["train"] == job_from_words("smile", {"preset": "paper"}).settings["train"]
-    assert other.overrides["body"] == "data/body"
+    own = base(**{"train.iterations": "7", "artifacts": str(toy.store)})
+    other = own.under_preset("paper")
+    assert other.settings["train"] == open_job("smile", parse_request({"preset": "paper"})).settings["train"]
+    assert other.request.workspace == own.request.workspace
 
 
 @pytest.mark.parametrize("subject", ["smile", "mannequin_head"])
 @pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_every_level_can_be_set_and_changes_something(subject, preset):
-    base = job_from_words(subject, {"preset": preset})
+    base = open_job(subject, parse_request({"preset": preset}, subject))
     levels = sweep_levels(base.settings)
     parameters = [level.parameter for level in levels]
     assert {"iterations", "number of Gaussians", "image size", "fit effort", "precision", "LPIPS"} <= {
@@ -145,13 +147,19 @@ def test_every_level_can_be_set_and_changes_something(subject, preset):
     firsts = len(dict.fromkeys(parameters))
     assert len(set(parameters[:firsts])) == firsts  # each parameter's first level before any second one
     for level in levels:
-        changed = job_from_words(subject, {"preset": preset, **dict(level.overrides)})
+        changed = open_job(subject, parse_request({"preset": preset, **dict(level.overrides)}, subject))
         assert changed.settings != base.settings, level.label
         assert level.factor > 0
 
 
+def test_every_part_of_the_method_can_be_left_out(tmp_path):
+    base = base_of("smile", parse_request({}), tmp_path / "log.txt", {"auxiliary.generator": "auto"})
+    for key, variant in variants_of(base).items():
+        assert (base.job(variant.overrides).settings == base.settings) == (key == FULL)
+
+
 def levels_of(parameter, subject="smile", **words):
-    levels = sweep_levels(job_from_words(subject, words).settings)
+    levels = sweep_levels(open_job(subject, parse_request(words, subject)).settings)
     return [level for level in levels if level.parameter == parameter]
 
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.config.request import parse_request
 from pipeline.curves import SCHEMA
 from pipeline.settings import read_toml
 from pipeline.studies import ablation
@@ -180,7 +181,7 @@ def test_refined_poses_count_where_the_protocol_says_so(tmp_path):
     assert set(by_name(refined)["refinement_and_views"].rows["psnr"]) == {33.0}
     assert by_name(ablation_of(tmp_path))["refinement_and_views"].rows.loc["full", "psnr"] == 30
     for subject, counts in (("bike", True), ("smile", False)):
-        assert counts_refined(base_of(subject, {}, tmp_path / "log.txt")) == counts
+        assert counts_refined(base_of(subject, parse_request({}), tmp_path / "log.txt")) == counts
 
 
 def test_the_papers_figures_stand_beside_the_same_dataset_alone(tmp_path):
@@ -220,7 +221,7 @@ def test_an_ablation_is_written(tmp_path):
     found = ablation_of(tmp_path, failing=[("smile", "moves")])
     out = tmp_path / "out"
     out.mkdir()
-    write_ablation(out, "smile", found, base_of("smile", {}, out / "log.txt"), 12.0)
+    write_ablation(out, "smile", found, base_of("smile", parse_request({}), out / "log.txt"), 12.0)
     check_page(out / "report.html", pictures=2, tables=len(tables_of(found, "")))
     assert {path.name for path in out.iterdir()} >= {"table.md", "table.tex", "table.parquet"}
     assert len(pd.read_parquet(out / "table.parquet")) > 40
@@ -249,7 +250,7 @@ def tradeoff_of(folder, gains=(0.0, 2.0, 0.4, 0.1), costs=(20.0, 80.0, 30.0, 20.
     runs.append((result(folder, "preset draft", psnr=28.0, seconds=10.0), None, "draft"))
     measured += [{}, {"psnr": 28.0, "lpips_alex": 0.1}]
     fits = {"seconds": [1.0, 4.0], "clock": "processor", "pixels": [3.0, 2.0], "millimetres": [20.0, 12.0]}
-    base = base_of("smile", {}, folder / "log.txt")
+    base = base_of("smile", parse_request({}), folder / "log.txt")
     fits = pd.DataFrame(fits, index=[10, 40])
     return Tradeoff(base, point_table(runs, measured), {"balanced": 900.0}, fits, 60.0, 50.0)
 
