@@ -27,7 +27,7 @@ from pipeline.body import (
     read_poses,
 )
 from pipeline.camera import Camera
-from pipeline.clip.views import View, Views, cropped
+from pipeline.clip.views import View, ViewCache, cropped
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
 from pipeline.keypoints import Keypoints, read_keypoints
@@ -84,11 +84,11 @@ class FittedClip:
 
     def view(self, frame: int, box: Box | None = None) -> View:
         """A frame, or a box of it, as tensors with its camera."""
-        return self.views(box)[frame]
+        return self.cached_views(box)[frame]
 
-    def views(self, box: Box | None = None) -> Views:
+    def cached_views(self, box: Box | None = None) -> ViewCache:
         """All frames, or a box of each, kept in memory once they were read."""
-        return Views(self.folder, self.cameras, box)
+        return ViewCache(self.folder, self.cameras, box)
 
     def pose(self, frame: int) -> Pose:
         """The body's pose in a frame; ValueError where the fit has none."""

@@ -43,7 +43,7 @@ class View:
         return self.color * alpha + (1 - alpha) * background
 
 
-class Views:
+class ViewCache:
     """Numbered frames of a folder, kept in memory as far as it is reasonable.
 
     Attributes:

@@ -71,8 +71,7 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
     clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
     steps(trainer, 8)
     steps(clean, 8)
-    inputs = stage.read_inputs(context_for(subject, tmp_path / "unused"))
-    scores = [one.held_out(inputs.whole, inputs.split.test) for one in (trainer, clean)]
+    scores = [one.held_out(clean.data.clip.split.test) for one in (trainer, clean)]
     assert scores[0] > scores[1] - 6
 
 
@@ -212,8 +211,7 @@ def drift(subject, tmp_path, count, **settings):
     """The loss of every step, and the held-out PSNR at the end."""
     trainer = trainer_for(context_for(subject, tmp_path, iterations=count, **settings))
     taken = steps(trainer, count)
-    inputs = stage.read_inputs(context_for(subject, tmp_path))
-    return np.array(taken), trainer.held_out(inputs.whole, inputs.split.test)
+    return np.array(taken), trainer.held_out(trainer.data.clip.split.test)
 
 
 def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):

@@ -39,15 +39,14 @@ def without_kernels(monkeypatch):
 def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
     """The loss terms of some steps, and the gradients of the last one."""
     context = context_for(subject, output, **ALL_ON)
-    inputs = stage.read_inputs(context)
-    refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
-    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
+    data = stage.read_training_data(context)
+    refinement = stage.PoseRefinement(data.poses, data.clip.split.train)
+    avatar, data = stage.prepare(data, refinement, context.settings, context)
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    scored = visibility_gate.VisibilityGate(avatar, len(inputs.body.v_template), context.settings)
-    evidence = inputs.evidence(texture)
-    trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
+    scored = visibility_gate.VisibilityGate(avatar, len(data.clip.body.v_template), context.settings)
+    trainer = stage.Trainer(avatar, refinement, data, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]
     named = {**dict(avatar.named_parameters()), **dict(refinement.named_parameters())}
     return values, {name: one.grad for name, one in named.items() if one.grad is not None}

@@ -39,10 +39,11 @@ def trainer(subject, tmp_path):
 def truth(subject, tmp_path) -> torch.Tensor:
     """Which body vertices the five training frames have in their picture, [5, V]."""
     context = context_for(subject, tmp_path / "truth")
-    inputs = stage.read_inputs(context)
+    data = stage.read_training_data(context)
+    train = data.clip.split.train
     body = trainer_for(context_for(subject, tmp_path / "whole", gate=False))
     return torch.stack(
-        [stage.ever_in_frame(body.avatar, body.poses, inputs.crops, (frame,)) for frame in inputs.split.train]
+        [stage.ever_in_frame(body.avatar, body.poses, data.crops, (frame,)) for frame in train]
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pipeline.body import load_body, posed_vertices, read_poses, write_poses
-from pipeline.clip import Views, read_fitted_clip
+from pipeline.clip import ViewCache, read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_mask
 from pipeline.keypoints import empty_keypoints, write_keypoints
@@ -70,8 +70,8 @@ def test_a_view_is_the_frame_and_its_camera(written):
 
 
 def test_views_keep_what_they_have_read(subject):
-    views = read(subject).views(BOX)
-    assert isinstance(views, Views)
+    views = read(subject).cached_views(BOX)
+    assert isinstance(views, ViewCache)
     before = views[0]
     (subject / "ingest" / "frames" / "000000.png").unlink()
     assert torch.equal(views[0].color, before.color)
