@@ -20,8 +20,8 @@ from pipeline.config.request import parse_request
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
 from pipeline.job import open_job, shown
+from pipeline.run.progress import Progress
 from pipeline.settings import read_toml
-from pipeline.stage import Progress
 from pipeline.studies.run import Ending, Failure, base_words, run_variants, scale_words, study_folder
 from pipeline.studies.sizes import sizes_of, versions_of
 from pipeline.studies.tables import HERE, MEAN, PAPER, Column, Row, Table, Value, values_of

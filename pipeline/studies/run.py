@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.job import open_job
-from pipeline.stage import Progress
+from pipeline.run.progress import Progress
 from pipeline.study import Outcome, Variant, outcome_of
 from pipeline.workspace import Workspace
 
