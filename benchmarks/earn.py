@@ -61,7 +61,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "pose refinement": {"train.refine_poses": "false"},
     "SSIM": {"train.ssim": "0"},
     "noise on the pose": {"train.pose_noise": "0"},
-    "first colours": {"train.initial_color": "false"},
+    "initial colours": {"train.initial_color": "false"},
     "smooth offsets": {"train.laplacian_offset": "0", "train.laplacian_offset_face": "0"},
     "smooth scales": {"train.laplacian_scale": "0", "train.laplacian_scale_face": "0"},
     "smooth colours": {"train.laplacian_color": "0", "train.laplacian_color_hands": "0"},

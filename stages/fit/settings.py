@@ -19,10 +19,7 @@ Window = Annotated[int, Field(ge=0, le=1001)]
 class FitSettings:
     """Settings of the fit stage."""
 
-    iterations: Steps = setting(
-        200, "steps of adam over the whole clip, lm has its own; 0 publishes the initialisation"
-    )
-    solver: Literal["adam", "lm"] = setting("adam", "how the objective is minimised")
+    iterations: Steps = setting(200, "steps of Adam over the whole clip; 0 publishes the initialisation")
     minibatch: Count = setting(256, "frames posed at a time: memory does not grow with the clip")
     learning_rate: Factor = setting(1.0, "factor on Adam's step of every group of parameters")
 

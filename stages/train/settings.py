@@ -108,14 +108,8 @@ class TrainSettings:
         0.1, "fraction of the run, the warm-up, after which scores are looked at; 1: never"
     )
     gate_every: Count = setting(50, "iterations between looks")
-    gate_definition: Literal["in_frame", "contributes"] = setting(
-        "in_frame", "what counts as seen: in the frame, or contributes to the rendering"
-    )
     gate_threshold: Threshold | None = setting(
         None, "scores below are gated; none: found in the scores (Otsu)"
-    )
-    gate_guard: Literal["evidence", "authors"] = setting(
-        "evidence", "when Otsu is believed: with evidence, or as in the authors' release"
     )
     gate_rings: Rings = setting(2, "rings of neighbours added to what is left")
     unseen: Literal["nothing", "base", "generated"] = setting(
@@ -146,9 +140,6 @@ class TrainSettings:
     face: Weight = setting(0.0, "lambda_face; the paper's is 0.8")
     generated_every: Count = setting(5, "draws for one of a generated frame; the paper's is 2, equally often")
     generated: Weight = setting(0.1, "lambda_L1, lambda_ssim and lambda_lpips on generated frames")
-    mask_band: Pixels = setting(
-        0, "pixels on either side of the silhouette where the mask is in doubt; 0: believed"
-    )
 
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: Weight = setting(1e3, "smoothness of static and of all offsets together")

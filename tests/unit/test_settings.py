@@ -86,9 +86,7 @@ def test_what_does_not_fit_is_refused_and_names_its_origin(field, value):
 
 def test_what_is_out_of_range_names_its_origin_though_a_stronger_layer_replaces_it():
     layers = [Layer("preset", {"train": {"rate": 0}}), command_line_layer({"train.rate": "1"})]
-    with pytest.raises(
-        UserError, match="preset: train.rate must be a number more than 0 .*, not 0"
-    ):
+    with pytest.raises(UserError, match="preset: train.rate must be a number more than 0 .*, not 0"):
         resolve({"train": Train}, layers)
 
 
