@@ -29,10 +29,11 @@ from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask, write_png
 from pipeline.job import Job, job_from_words, run_stage
-from pipeline.metrics import Lpips, composite, psnr, ssim
+from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.records import read_split, write_cameras
 from pipeline.splat import render
 from stages.ingest.mannequin.footage import Filming
@@ -200,7 +201,7 @@ def _scored(
         for degrees in UNSEEN if side == "unseen" else (0.0,):
             camera = around(scene, degrees)
             picture = _filmed(scene, frame, camera)
-            target = composite(picture.image, picture.mask)
+            target = composite_frame(picture.image, picture.mask)
             image = render(gaussians, camera).color.clamp(0, 1)
             part = _box(picture.mask)
             pair = image[part], target[part]

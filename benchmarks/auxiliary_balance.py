@@ -27,9 +27,10 @@ from benchmarks.held_out_views import _job
 from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body, read_poses
+from pipeline.composite import composite_frame
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.metrics import composite, psnr
+from pipeline.metrics import psnr
 from pipeline.records import read_cameras
 from pipeline.splat import render
 
@@ -117,7 +118,7 @@ def _scored(
         frame = common[place * len(common) // min(FRAMES, len(common))]
         row = poses.index(frame)
         image, mask = read_frame(seen.folder / "frames", frame), read_mask(seen.folder / "masks", frame)
-        target = composite(image, mask)
+        target = composite_frame(image, mask)
         gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
         made = render(gaussians, cameras[frame]).color.clamp(0, 1)
         part = _box(mask)

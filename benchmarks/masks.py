@@ -27,10 +27,11 @@ from torch import Tensor
 from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
 from pipeline.avatar import Avatar
+from pipeline.composite import composite_frame
 from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.job import job_from_words
-from pipeline.metrics.image import psnr
-from pipeline.metrics.protocol import composite, interior
+from pipeline.metrics.protocol import interior
+from pipeline.metrics.psnr import psnr
 from pipeline.study import made
 
 SUBJECTS = ("mannequin_upper", "mannequin_head")
@@ -119,7 +120,7 @@ def judge(avatar: Avatar, ingest: Path, fit: Path) -> dict[str, float]:
     last: Tensor | None = None
     for frame in clip.test:
         mask, shown = read_mask(ingest / "masks", frame), clip.render(avatar, frame)
-        truth, image = composite(read_frame(ingest / "frames", frame), mask), shown.color.clamp(0, 1)
+        truth, image = composite_frame(read_frame(ingest / "frames", frame), mask), shown.color.clamp(0, 1)
         true_alpha, inside = torch.from_numpy(mask).float() / 255, interior(mask)
         element = np.ones((2 * BAND + 1, 2 * BAND + 1), np.uint8)
         near = torch.from_numpy(cv2.dilate(mask, element) - cv2.erode(mask, element) > 127)

@@ -18,7 +18,7 @@ from typing import Any
 
 AUTO = "auto"
 BACKGROUNDS = ("black", "white")
-"""What a person can be composited on; their values are in :mod:`pipeline.metrics.protocol`."""
+"""What a person can be composited on; their values are in :mod:`pipeline.composite`."""
 
 OWN, TRUTH = RENDER_MASKS = ("own", "truth")
 """Whose alpha cuts the avatar's picture out: its own, or the truth's mask after it."""

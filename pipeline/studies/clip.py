@@ -20,10 +20,12 @@ from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import BakedAvatar, bake
 from pipeline.body import load_body, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import BACKGROUNDS, BLACK, composite_frame, over
 from pipeline.frames import read_frame, read_mask
 from pipeline.metrics import Lpips
-from pipeline.metrics.image import psnr, ssim
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK, composite, interior, over
+from pipeline.metrics.protocol import interior
+from pipeline.metrics.psnr import psnr
+from pipeline.metrics.ssim import ssim
 from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Gaussians, render
 from pipeline.studies.notes import Notes, Numbers
@@ -79,7 +81,7 @@ def quality(outcome: Outcome, clip: Clip) -> Numbers:
 def _frame_quality(gaussians: Gaussians, camera: Camera, frame: int, clip: Clip) -> Numbers:
     rendering = render(gaussians, camera)
     mask = read_mask(clip.ingest / "masks", frame)
-    person = partial(composite, read_frame(clip.ingest / "frames", frame), mask)
+    person = partial(composite_frame, read_frame(clip.ingest / "frames", frame), mask)
 
     def picture(background: str) -> torch.Tensor:
         return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)

@@ -14,6 +14,7 @@ import torch
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
 from pipeline.camera import Camera
+from pipeline.composite import over, to_bytes
 from pipeline.frames import write_png, write_video
 from pipeline.motion.names import TURNTABLE, motion_name
 from pipeline.motion.place import place
@@ -163,8 +164,7 @@ def drawn(
 
 def on_background(rendering: Rendering, color: tuple[float, float, float]) -> np.ndarray:
     """The video's picture, mixed as the clip's colours are encoded: [H, W, 3] uint8 RGB."""
-    image = rendering.color + (1 - rendering.alpha[..., None]) * torch.tensor(color)
-    return (image.clamp(0, 1) * 255).round().byte().numpy()
+    return to_bytes(over(rendering.color, rendering.alpha, torch.tensor(color)))
 
 
 class _Clock:

@@ -11,6 +11,7 @@ import torch
 
 from pipeline.body import write_poses
 from pipeline.camera import Camera
+from pipeline.composite import composite
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.records import write_cameras, write_json
@@ -126,8 +127,7 @@ def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
 
 def tile(image: np.ndarray, mask: np.ndarray, trust: np.ndarray) -> np.ndarray:
     """A frame for the contact sheet: the person on grey, and below it what is learnt from it."""
-    alpha = mask[..., None] / np.float32(255)
-    person = image * alpha + 208 * (1 - alpha)
+    person = composite(image, mask / np.float32(255), 208.0)
     learnt = person * (0.25 + 0.75 * trust[..., None] / np.float32(255))
     both = np.concatenate([person, learnt]).astype(np.uint8)
     scale = 2 * _TILE / both.shape[0]

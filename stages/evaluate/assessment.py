@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from pipeline.metrics.protocol import composite
+from pipeline.composite import composite_frame
 from stages.evaluate.baselines import Baselines, prepare_baselines
 from stages.evaluate.evidence import Evidence, Pose, evenly
 from stages.evaluate.judging import Judge
@@ -173,5 +173,5 @@ class _Panel:
     def _ceiling(self, frame: int) -> list[Score]:
         if frame not in self.extras.second.masks:
             return []
-        second = partial(composite, self.evidence.frame(frame), self.extras.second.masks[frame])
+        second = partial(composite_frame, self.evidence.frame(frame), self.extras.second.masks[frame])
         return self.judge.score(CEILING, self.judge.make(second))

@@ -7,10 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.composite import to_bytes
 from pipeline.metrics.identity import Face, identity_cosine, identity_distance
 from pipeline.metrics.regions import Box
 from stages.evaluate.judging import Truth
-from stages.evaluate.rendering import to_bytes
 from stages.evaluate.scoring import Picture, Score
 
 ROOM = 0.5  # of the face crop's size, around it, for the face finder

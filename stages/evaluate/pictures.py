@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from pipeline.composite import to_bytes
 from pipeline.metrics.regions import Box
-from stages.evaluate.rendering import to_bytes
 
 CLOSEUP = 160  # pixels
 _GAP = 6  # pixels between pictures

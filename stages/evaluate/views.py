@@ -20,9 +20,11 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, edges, rasterize, read_identity, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import BACKGROUNDS, BLACK, composite_frame
 from pipeline.frames import read_frame, read_mask
-from pipeline.metrics.image import psnr, ssim
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK, composite, interior, person
+from pipeline.metrics.protocol import interior, person
+from pipeline.metrics.psnr import psnr
+from pipeline.metrics.ssim import ssim
 from pipeline.records import read_cameras
 from pipeline.splat import render
 from stages.evaluate.evidence import Evidence, evenly
@@ -101,7 +103,7 @@ def score_views(
         for frame, camera in ((frame, cameras[frame]) for frame in frames):
             unseen = filmed.unseen_pixels(camera, frame) if filmed is not None else None
             image, mask = read_frame(folder / "frames", frame), read_mask(folder / "masks", frame)
-            truth = partial(composite, image, mask)
+            truth = partial(composite_frame, image, mask)
             for method, on in _shown(evidence, animate, mesh, camera, frame):
                 values = _values(on, truth, mask, unseen, background)
                 scores += [Score(frame, VIEWS, method, *value, folder.name) for value in values.items()]

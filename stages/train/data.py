@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pipeline.camera import Camera
+from pipeline.composite import composite
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
 from pipeline.person import Box
@@ -39,8 +40,7 @@ class View:
 
     def composite(self, background: Tensor) -> Tensor:
         """The person over a plain background, [3] -> [H, W, 3]."""
-        alpha = self.alpha[..., None]
-        return self.color * alpha + (1 - alpha) * background
+        return composite(self.color, self.alpha, background)
 
 
 class Frames:

@@ -18,8 +18,10 @@ from hypothesis.extra import numpy as hnp
 
 from pipeline.body import Poses, skin, uniform_laplacian, vertex_normals
 from pipeline.camera import facing_camera, project
+from pipeline.composite import composite_frame
 from pipeline.guard import finite
-from pipeline.metrics import composite, interior, psnr, ssim
+from pipeline.metrics import interior, psnr, ssim, ssim_loss
+from pipeline.metrics.ssim import plain_ssim_loss
 from pipeline.splat import Gaussians, render
 from pipeline.visibility import LARGEST_LOSS, authors_threshold, cost, evidence_threshold, histogram, otsu
 from stages.fit import terms
@@ -236,7 +238,7 @@ def scores_are_symmetric_and_bounded(pair):
 def image_losses_are_finite_with_finite_slopes(pair):
     image, truth = map(tensor, pair)
     leaf = image.requires_grad_()
-    fused, plain = losses.ssim(leaf, truth), losses.plain_ssim(leaf, truth)
+    fused, plain = ssim_loss(leaf, truth), plain_ssim_loss(leaf, truth)
     assert abs(float((fused - plain).detach())) < 2e-3
     (losses.l1(leaf, truth) + fused + plain).backward()
     assert leaf.grad.isfinite().all()
@@ -272,7 +274,7 @@ def regularisers_are_not_negative_and_have_finite_slopes(offset, log_scale):
 @property_of(hnp.arrays(np.uint8, (8, 6, 3)), hnp.arrays(np.uint8, (8, 6)), st.integers(0, 9))
 def a_composite_and_its_interior_lie_in_the_picture(frame, mask, erosion):
     for background in ("black", "white"):
-        image = composite(frame, mask, background)
+        image = composite_frame(frame, mask, background)
         assert image.min() >= 0 and image.max() <= 1 + 1e-6
     assert not (interior(mask, erosion).numpy() & (mask <= 127)).any()
 

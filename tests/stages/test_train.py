@@ -17,7 +17,7 @@ from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.plan import read_plan
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import losses
+from stages.train import losses, objective
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
 from stages.train.gate import SCHEMA, Gate
@@ -259,7 +259,7 @@ def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_
         calls.append(1)
         return losses.l1(image, target) * (float("nan") if len(calls) == 3 else 1)
 
-    monkeypatch.setattr(losses, "ssim", poisoned)
+    monkeypatch.setattr(objective, "ssim_loss", poisoned)
     with pytest.raises(UserError, match="loss term 'ssim' is nan at iteration 2"):
         stage.run(context)
     assert not list(context.output.iterdir())

@@ -9,7 +9,6 @@ import torch
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.intervals import block_length, interval, stretch
-from pipeline.metrics.protocol import composite, cut_out, over, person
 from pipeline.metrics.regions import region_boxes
 from pipeline.protocols import PROTOCOLS, Protocol, chosen
 
@@ -130,30 +129,3 @@ def test_the_paper_is_one_of_the_protocols():
     with pytest.raises(ValueError, match="render_mask must be one of auto, own, truth, not x"):
         chosen({"render_mask": "x"})
     assert set(dataclasses.asdict(PROTOCOLS["ours"])) == {"background", "render_mask", "refine_test_poses"}
-
-
-@pytest.mark.parametrize("background", ["black", "white"])
-def test_the_truths_mask_forgives_what_is_outside_and_leaves_the_rest(background):
-    mask = np.zeros((4, 5), np.uint8)
-    mask[1:3, 1:4], mask[1, 1] = 255, 51
-    color = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
-    alpha = torch.ones(4, 5)
-    alpha[1, 2], alpha[1, 1], alpha[3, 3] = 0.5, 0.1, 0.0
-    both = [over(color * alpha[..., None], alpha, name) for name in ("black", "white")]
-    value = {"black": 0.0, "white": 1.0}[background]
-    cut, own = cut_out(*both, mask, background), both[background == "white"]
-    assert torch.allclose(cut[0], torch.full((5, 3), value), atol=1e-6)
-    for place in ((2, 2), (1, 2), (1, 1)):  # within the mask, half-transparent ones too
-        assert torch.allclose(cut[place], own[place], atol=1e-6)
-    alpha[1, 1] = 1.0  # of which the mask holds a fifth
-    both = [over(color * alpha[..., None], alpha, name) for name in ("black", "white")]
-    edge = cut_out(*both, mask, background)[1, 1]
-    assert torch.allclose(edge, 0.2 * color[1, 1] + 0.8 * value, atol=1e-6)
-
-
-def test_the_truth_is_not_changed_by_its_own_mask():
-    mask = np.array([[0, 60, 200, 255]], np.uint8)
-    frame = np.full((1, 4, 3), 180, np.uint8)
-    black, white = (composite(frame, mask, name) for name in ("black", "white"))
-    assert torch.allclose(cut_out(black, white, mask, "white"), white, atol=1e-6)
-    assert int(person(mask).sum()) == 2
