@@ -16,7 +16,7 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.body import Poses, skin, uniform_laplacian, vertex_normals
+from pipeline.body import Poses, linear_blend_skinning, uniform_laplacian, vertex_normals
 from pipeline.camera import facing_camera, project
 from pipeline.composite import composite_frame
 from pipeline.guard import finite
@@ -169,7 +169,7 @@ def skinning_stays_among_where_the_joints_put_a_point(weights, points, turns):
     share = tensor(weights) + 1e-6
     share = share / share.sum(1, keepdim=True)
     transforms = torch.cat([roma.rotvec_to_rotmat(tensor(turns)), tensor(turns)[..., None]], -1)
-    found = skin(transforms[None], share, tensor(points))[0]
+    found = linear_blend_skinning(transforms[None], share, tensor(points))[0]
     each = torch.einsum("jab,nb->nja", transforms[..., :3], tensor(points)) + transforms[..., 3]
     slack = 1e-4 * (1 + each.abs().max())
     assert ((found >= each.amin(1) - slack) & (found <= each.amax(1) + slack)).all()

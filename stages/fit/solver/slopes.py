@@ -13,7 +13,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from pipeline.body.skinning import matrix_transforms
+from pipeline.body.skinning import forward_kinematics
 from stages.fit.parameters import LandmarkModel, Parameters
 
 _LEAST = 1e-6  # of skinning weight that makes a landmark depend on a joint
@@ -117,7 +117,7 @@ def pose(model: LandmarkModel, parameters: Parameters) -> Posed:
     rest = model.rest + model.shape @ parameters.betas + model.joint @ parameters.joint_offset
     rest = rest + model.face @ parameters.face_control
     moved = parameters.expression @ model.expression.flatten(0, 1).mT
-    transforms, places = matrix_transforms(parameters.matrices, joints, model.parents)
+    transforms, places = forward_kinematics(parameters.matrices, joints, model.parents)
     orientation = transforms[..., :3]
     parents = torch.tensor(model.parents)
     above = orientation[:, parents.clamp_min(0)]
