@@ -140,15 +140,6 @@ def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
     )
 
 
-def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` of the items, evenly spaced, first and last included."""
-    if count >= len(items):
-        return list(items)
-    if count == 1:
-        return [items[len(items) // 2]]
-    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
-
-
 @lru_cache(maxsize=4)
 def _rows(frames: tuple[int, ...]) -> Mapping[int, int]:
     return {frame: row for row, frame in enumerate(frames)}

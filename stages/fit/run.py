@@ -26,9 +26,10 @@ from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.records import read_cameras, read_footage, write_json
+from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context
 from pipeline.threads import threads
-from stages.fit.overlay import overlays, sheet, sheet_rows
+from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.pose_given import given_poses, keep_given
 from stages.fit.registration import Registration, register, steps_of, views_of
 from stages.fit.residuals import group_means, write_residuals
@@ -114,7 +115,7 @@ def write_overlays(
 ) -> None:
     """Write ``overlay.mp4``, every frame, and ``overlay.png``, a contact sheet."""
     ingest = context.inputs["ingest"]
-    wanted, kept = sheet_rows(len(poses)), {}
+    wanted, kept = spread_end_to_end(range(len(poses)), SHEET_FRAMES), {}
     opacity = context.settings.overlay_opacity
 
     def drawing() -> Iterator[np.ndarray]:

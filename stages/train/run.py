@@ -12,15 +12,16 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
+from pipeline.boxes import clip_box
 from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
-from pipeline.person import person_box
 from pipeline.plan import read_plan
-from pipeline.records import Split, read_cameras, read_footage, read_split, spread
+from pipeline.records import Split, read_cameras, read_footage, read_split
 from pipeline.settings import as_dict
+from pipeline.spread import spread_from_start
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
@@ -141,7 +142,7 @@ def read_inputs(context: Context) -> Inputs:
         read_split(ingest / "split.json"),
     )
     _check(fit / "poses.parquet", poses, split, set(cameras))
-    box = person_box(ingest, split.train, settings.crop_margin)
+    box = clip_box(ingest, split.train, settings.crop_margin)
     return Inputs(
         body=body,
         identity=read_identity(fit / "identity.safetensors", body),
@@ -172,8 +173,8 @@ def prepare(
     set_time_range(avatar, inputs)
     texture = None
     if settings.initial_color or settings.face:
-        chosen = spread(inputs.split.train, settings.color_frames)
-        made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
+        chosen = spread_from_start(inputs.split.train, settings.color_frames)
+        made = spread_from_start(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
         logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
@@ -225,9 +226,9 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
     poses = inputs.all_poses
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
-    shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
+    shown = spread_from_start(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
     clock, first = Clock(context.work, trainer.iteration, compiled), trainer.iteration
-    watched = shown or spread(inputs.split.train, WATCHED)
+    watched = shown or spread_from_start(inputs.split.train, WATCHED)
     if trainer.untrained is None:
         with clock.aside():
             trainer.untrained = trainer.held_out(inputs.whole, watched)

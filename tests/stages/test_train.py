@@ -311,24 +311,6 @@ def test_poses_that_cannot_be_used_say_what_to_do(subject, tmp_path, change, mes
     assert "fit" in str(caught.value)
 
 
-def test_masks_without_anybody_say_so(subject, tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame in range(3):
-        write_mask(tmp_path / "masks", frame, np.zeros((64, 48), np.uint8))
-    with pytest.raises(UserError, match="nobody"):
-        stage.person_box(tmp_path, (0, 1, 2), 8)
-
-
-def test_person_box_holds_every_mask_and_stays_in_the_frame(tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame, column in enumerate((3, 30)):
-        mask = np.zeros((64, 48), np.uint8)
-        mask[20:60, column : column + 10] = 255
-        write_mask(tmp_path / "masks", frame, mask)
-    box = stage.person_box(tmp_path, (0, 1), 8)
-    assert (box.left, box.top, box.right, box.bottom) == (0, 12, 48, 64)
-
-
 def test_resumed_run_takes_up_the_skinning_weights_where_they_were(subject, tmp_path):
     settings = {"skinning": "nearest", "skin_every": 4, "face": 0.0}
     through, stopped, resumed = (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.boxes import Box
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.intervals import block_length, interval, stretch
@@ -101,13 +102,12 @@ def points(part, middle, extent, score=0.9):
 def test_a_face_has_a_square_around_it_and_hands_have_one_each():
     both = points(FACE, (100, 60), 40) + points(LEFT_HAND, (30, 100), 20) + points(RIGHT_HAND, (170, 100), 20)
     boxes = region_boxes(both, 200, 150)
-    assert boxes["face"] == [(70, 30, 130, 90)]
-    assert boxes["hands"] == [(16, 86, 44, 114), (156, 86, 184, 114)]
+    assert boxes["face"] == [Box(70, 30, 130, 90)]
+    assert boxes["hands"] == [Box(16, 86, 44, 114), Box(156, 86, 184, 114)]
 
 
 def test_crops_stay_in_the_picture_and_what_was_not_found_has_none():
-    (left, top, right, bottom) = region_boxes(points(FACE, (5, 5), 40), 200, 150)["face"][0]
-    assert (left, top, right, bottom) == (0, 0, 35, 35)
+    assert region_boxes(points(FACE, (5, 5), 40), 200, 150)["face"] == [Box(0, 0, 35, 35)]
     assert region_boxes(points(FACE, (100, 60), 40, score=0.2), 200, 150) == {}
     assert region_boxes(points(FACE, (100, 60), 6), 200, 150) == {}  # 9 pixels show nothing
     assert region_boxes(points(FACE, (-500, 60), 40), 200, 150) == {}
