@@ -68,7 +68,7 @@ def person_box(
     columns, rows = np.zeros(0, bool), np.zeros(0, bool)
     for mask in masks:
         person = np.asarray(mask >= faintest)
-        columns, rows = _either(columns, person.any(axis=0)), _either(rows, person.any(axis=1))
+        columns, rows = _either(columns, np.any(person, axis=0)), _either(rows, np.any(person, axis=1))
     if not columns.any():
         return None
     left, right = _extent(columns, margin, smallest)
