@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-BLACK, WHITE = "black", "white"
+from pipeline.config.choices import Background
+
+BLACK, WHITE = get_args(Background)
 
 BACKGROUNDS = {BLACK: 0.0, WHITE: 1.0}
 """What a person can be composited on -> the value of its pixels."""
 
-Background = str | float | Tensor
+AnyBackground = str | float | Tensor
 """One of ``BACKGROUNDS``, the value of a grey one, or a colour [3]."""
 
 Picture = TypeVar("Picture", Tensor, np.ndarray)
@@ -22,7 +24,7 @@ Picture = TypeVar("Picture", Tensor, np.ndarray)
 def over(
     color: Picture,  # [H, W, 3]
     alpha: Picture,  # [H, W]
-    background: Background = BLACK,
+    background: AnyBackground = BLACK,
 ) -> Picture:
     """Premultiplied colour over a background, ``color + (1 - alpha) background``: [H, W, 3].
 
@@ -43,7 +45,7 @@ def over(
 def composite(
     color: Picture,  # [H, W, 3]
     alpha: Picture,  # [H, W]
-    background: Background = BLACK,
+    background: AnyBackground = BLACK,
 ) -> Picture:
     """Straight colour over a background, ``alpha color + (1 - alpha) background``: [H, W, 3].
 
@@ -57,7 +59,7 @@ def composite(
 def composite_frame(
     frame: np.ndarray,  # [H, W, 3] uint8
     mask: np.ndarray,  # [H, W] uint8
-    background: Background = BLACK,
+    background: AnyBackground = BLACK,
 ) -> Tensor:
     """The person of a stored frame on a background: [H, W, 3] float32 in [0, 1].
 
@@ -74,7 +76,7 @@ def cut_out(
     black: Tensor,  # [H, W, 3]
     white: Tensor,  # [H, W, 3]
     mask: np.ndarray,  # [H, W] uint8
-    background: Background = BLACK,
+    background: AnyBackground = BLACK,
 ) -> Tensor:
     """A picture of which no more is left than the truth's mask holds: [H, W, 3].
 

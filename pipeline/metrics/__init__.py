@@ -1,7 +1,7 @@
 """How alike two images are: the only definition of each number that the project reports.
 
-Images are float tensors [H, W, 3] with values in [0, 1]; masks are [H, W]. The protocol (what is
-composited on what, which pixels count) is in :mod:`pipeline.metrics.protocol`.
+Images are float tensors [H, W, 3] with values in [0, 1]; masks are [H, W]. Which pixels
+count is in :mod:`pipeline.metrics.protocol`, compositing in :mod:`pipeline.composite`.
 """
 
 from pipeline.metrics.lpips import Lpips

@@ -42,7 +42,6 @@ from stages.evaluate.records import (
     StageRecord,
     fit_error,
     fit_seconds,
-    plan_savings,
     read_gate,
     stage_records,
 )
@@ -229,7 +228,7 @@ def gather(
         overlay=(fit / "overlay.mp4", fit / "overlay.png"),
         curve=draw_curve(read_curve(train / "curve.parquet", "run the train stage again")),
         fit_curve=draw_fit(read_curve(fit / "curve.parquet", "run the fit stage again"), fit_seconds(fit)),
-        plan=plan_rows(plan, plan_savings(train)),
+        plan=plan_rows(plan),
         scores=draw_scores(gate.scores, gate.tau),
         gate=gate.why,
         refinement=refinement_cost(context, refinement),

@@ -11,19 +11,19 @@ from pipeline.body import load_body
 from pipeline.device import moved
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import gate, loop, objective, visibility
+from stages.train import initial_colors, loop, objective, visibility_gate
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
 ALL_ON = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
-    "subdivisions": 1, "subdivide_from": 0.4, "gate_definition": "contributes", "skinning": "nearest",
+    "subdivisions": 1, "subdivide_from": 0.4, "skinning": "nearest",
     "skin_every": 3, "unseen": "base", "arm_color": 0.1, "hand_color": 0.1, "hand_normal": 0.1,
-    "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5, "mask_band": 1,
+    "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, loop, visibility, gate)
+RENDERERS = (objective, loop, initial_colors)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    scored = gate.Gate(avatar, len(inputs.body.v_template), context.settings)
+    scored = visibility_gate.VisibilityGate(avatar, len(inputs.body.v_template), context.settings)
     evidence = inputs.evidence(texture)
     trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]
