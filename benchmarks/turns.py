@@ -23,11 +23,11 @@ from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
 from pipeline.avatar import Avatar
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
 from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.job import open_job
 from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
-from pipeline.metrics.protocol import composite
 from pipeline.process import make_results
 from pipeline.records import read_split
 from pipeline.splat import Gaussians, render
@@ -98,7 +98,9 @@ def faces_of(reader: FaceReader, clip: Clip, avatar: Avatar) -> tuple[list[float
 
 def person(clip: Clip, frame: int) -> np.ndarray:
     """The person of a frame on black, [H, W, 3] uint8."""
-    image = composite(read_frame(clip.ingest / "frames", frame), read_mask(clip.ingest / "masks", frame))
+    image = composite_frame(
+        read_frame(clip.ingest / "frames", frame), read_mask(clip.ingest / "masks", frame)
+    )
     return (255 * image).round().byte().numpy()
 
 

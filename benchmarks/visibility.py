@@ -33,6 +33,7 @@ from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
+from pipeline.spread import spread_from_start
 from pipeline.visibility import evidence_threshold
 from stages.plan.measure import read_clip, visibility
 from stages.train import run as training
@@ -152,7 +153,7 @@ def in_turn(trainers: Mapping[str, Trainer], rounds: int) -> dict[str, float]:
 
 def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> list[dict[str, Any]]:
     """Trains every variant of one subject and scores it."""
-    frames = training.spread(subject.inputs.split.test, options.frames)
+    frames = spread_from_start(subject.inputs.split.test, options.frames)
     trainers, rows = {}, []
     for name in options.variants:
         forced = name == "forced"

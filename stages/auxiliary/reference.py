@@ -18,7 +18,7 @@ from pipeline.body import Landmarks, joint_index, joint_orientations, locate, po
 from pipeline.camera import Camera, project
 from pipeline.frames import read_frame, read_mask
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.records import spread
+from pipeline.spread import spread_from_start
 from stages.auxiliary.crop import Framing
 from stages.auxiliary.skeleton import driven_keypoints
 from stages.auxiliary.texture import FineSurface, paint
@@ -58,7 +58,7 @@ class Score:
 def score_frames(clip: Clip) -> list[Score]:
     """Score some training frames, best first."""
     looks = []
-    for frame in spread(clip.train, LOOKED_AT):
+    for frame in spread_from_start(clip.train, LOOKED_AT):
         image, mask = read_frame(clip.folder / "frames", frame), read_mask(clip.folder / "masks", frame)
         points = clip.keypoints.whole_body[clip.keypoints.index(frame)]
         looks.append((frame, facing(clip, frame), sharpness(image, mask), points, surety(mask)))

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.body import load_landmarks
 from pipeline.errors import UserError
 from pipeline.plan import read_plan
-from pipeline.records import spread
+from pipeline.spread import spread_from_start
 from stages.auxiliary import texture
 from stages.auxiliary.accept import accept_checked, accept_exact
 from stages.auxiliary.crop import find_framing
@@ -46,7 +46,7 @@ def run(context: Context) -> None:
     clip = read_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
     landmarks, settings = load_landmarks(clip.body, context.body), context.settings
     turn, surface = make_turn(clip, settings), texture.fine_surface(clip.body, settings.texture_levels)
-    seen = texture.gather(clip, surface, spread(clip.train, settings.texture_frames), context)
+    seen = texture.gather(clip, surface, spread_from_start(clip.train, settings.texture_frames), context)
     colors, framing = texture.complete(surface, seen, settings.texture_light), find_framing(clip)
     context.log(f"the clip shows {seen.known.mean():.0%} of the surface")
     if generator != "texture" or settings.texture_guidance:

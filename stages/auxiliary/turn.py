@@ -26,6 +26,7 @@ from pipeline.camera import Camera, facing_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints, read_keypoints
 from pipeline.records import read_cameras, read_split
+from pipeline.spread import spread_end_to_end
 from stages.auxiliary.settings import AuxiliarySettings
 
 ID_OFFSET = 100_000
@@ -148,8 +149,8 @@ def _placed(clip: Clip, poses: Poses, settings: AuxiliarySettings) -> tuple[Came
     """The camera, and where the pelvis has to be before it: [3]."""
     width, height = settings.width, settings.height
     focal = height / 2 / math.tan(_FIELD / 2)
-    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).round().astype(int))
-    vertices = torch.cat([posed_vertices(clip.body, clip.identity, poses, int(row)) for row in rows])
+    rows = spread_end_to_end(range(len(poses)), 24)
+    vertices = torch.cat([posed_vertices(clip.body, clip.identity, poses, row) for row in rows])
     low, high = vertices.amin(0), vertices.amax(0)
     middle = torch.stack([torch.zeros(()), (low[1] + high[1]) / 2, torch.zeros(())])
     away = (vertices - middle).abs()

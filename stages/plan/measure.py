@@ -16,12 +16,13 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import PARTS, BodyModel, Identity, Poses, pose_body, read_identity, read_poses
+from pipeline.boxes import MARGIN, clip_box
 from pipeline.camera import Camera, project, to_camera
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
-from pipeline.person import MARGIN, person_box
 from pipeline.plan import AZIMUTH_STEP
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split, spread
+from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split
+from pipeline.spread import spread_from_start
 from pipeline.tables import read_table
 from pipeline.visibility import body_in_frame
 
@@ -72,8 +73,8 @@ def read_clip(ingest: Path, fit: Path, body: BodyModel) -> Clip:
         raise UserError(
             f"{fit / 'poses.parquet'}: frame {missing[0]} has no pose or no camera; run fit again"
         )
-    box = person_box(ingest, split.train, MARGIN)
-    size = (box.right - box.left, box.bottom - box.top)
+    box = clip_box(ingest, split.train, MARGIN)
+    size = (box.width, box.height)
     return Clip(
         footage=read_footage(ingest / "footage.json"),
         split=split,
@@ -127,7 +128,7 @@ def gaussian_pixels(clip: Clip) -> float:
     The root of the area that each has of what faces the camera within the person's box: the mean over
     ``LOOKED_AT`` training frames. 0 where none of them shows anything.
     """
-    frames = spread(clip.split.train, LOOKED_AT)
+    frames = spread_from_start(clip.split.train, LOOKED_AT)
     rows, poses = [clip.poses.index(frame) for frame in frames], clip.poses
     vertices, _ = pose_body(
         clip.body, clip.identity, poses.rotation[rows], poses.expression[rows], poses.transl[rows]

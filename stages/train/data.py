@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.boxes import Box
 from pipeline.camera import Camera
+from pipeline.composite import composite
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
-from pipeline.person import Box
 
 CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are drawn
 
@@ -39,8 +40,7 @@ class View:
 
     def composite(self, background: Tensor) -> Tensor:
         """The person over a plain background, [3] -> [H, W, 3]."""
-        alpha = self.alpha[..., None]
-        return self.color * alpha + (1 - alpha) * background
+        return composite(self.color, self.alpha, background)
 
 
 class Frames:
@@ -63,7 +63,7 @@ class Frames:
         """
         self.folder, self.cameras, self.box, self.generated = folder, cameras, box, generated
         camera = next(iter(cameras.values()))
-        pixels = (box.right - box.left) * (box.bottom - box.top) if box else camera.width * camera.height
+        pixels = box.width * box.height if box else camera.width * camera.height
         self._read = functools.lru_cache(maxsize=max(1, CACHED_BYTES // (4 * pixels)))(self._load)
 
     def __getitem__(self, frame: int) -> View:
@@ -77,7 +77,7 @@ class Frames:
         box, camera = self.box, self.cameras[frame]
         if box is None:
             return camera
-        return camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
+        return camera.cropped(box.left, box.top, box.width, box.height)
 
     def _load(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         color, alpha = read_frame(self.folder / "frames", frame), read_mask(self.folder / "masks", frame)
@@ -88,5 +88,4 @@ class Frames:
             )
         if self.box is None:
             return color, alpha
-        rows, columns = slice(self.box.top, self.box.bottom), slice(self.box.left, self.box.right)
-        return np.ascontiguousarray(color[rows, columns]), np.ascontiguousarray(alpha[rows, columns])
+        return np.ascontiguousarray(color[self.box.slices]), np.ascontiguousarray(alpha[self.box.slices])

@@ -13,15 +13,16 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
+from pipeline.boxes import clip_box
 from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
-from pipeline.person import person_box
 from pipeline.plan import read_plan
-from pipeline.records import Split, read_cameras, read_footage, read_split, spread
+from pipeline.records import Split, read_cameras, read_footage, read_split
 from pipeline.settings import as_dict
+from pipeline.spread import spread_from_start
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.apply_plan import apply_plan
@@ -141,7 +142,7 @@ def read_inputs(context: Context) -> Inputs:
         read_split(ingest / "split.json"),
     )
     _check(fit / "poses.parquet", poses, split, set(cameras))
-    box = person_box(ingest, split.train, settings.crop_margin)
+    box = clip_box(ingest, split.train, settings.crop_margin)
     return Inputs(
         body=body,
         identity=read_identity(fit / "identity.safetensors", body),
@@ -172,8 +173,8 @@ def prepare(
     set_time_range(avatar, inputs)
     texture = None
     if settings.initial_color or settings.face:
-        chosen = spread(inputs.split.train, settings.color_frames)
-        made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
+        chosen = spread_from_start(inputs.split.train, settings.color_frames)
+        made = spread_from_start(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
         logits = initial_color_logits(avatar.eval(), refinement, inputs.views, chosen, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
@@ -226,9 +227,9 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
     poses = inputs.all_poses
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
-    shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
+    shown = spread_from_start(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
     timer, first = TrainingTimer(context.work, trainer.iteration, compiled), trainer.iteration
-    watched = shown or spread(inputs.split.train, WATCHED)
+    watched = shown or spread_from_start(inputs.split.train, WATCHED)
     if trainer.untrained is None:
         with timer.paused():
             trainer.untrained = trainer.held_out(inputs.whole, watched)
