@@ -34,11 +34,11 @@ from benchmarks.fit_truth import ANCHORS, SOURCES, Clip, Errors, Stage, load_sta
 from pipeline.body import (
     Identity,
     expression_offsets,
+    forward_kinematics,
+    linear_blend_skinning,
     locate,
-    matrix_transforms,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.body.landmarks import join
 from pipeline.threads import threads
@@ -235,9 +235,13 @@ def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
     def of_mesh(parameters: Parameters) -> Tensor:
         identity = Identity(parameters.betas, parameters.joint_offset, spread @ parameters.face_control)
         rest = rest_vertices(body, identity) + expression_offsets(body, parameters.expression)
-        transforms, joints = matrix_transforms(parameters.matrices, rest_joints(body, identity), body.parents)
+        transforms, joints = forward_kinematics(
+            parameters.matrices, rest_joints(body, identity), body.parents
+        )
         place = parameters.transl[:, None]
-        return locate(points, joints + place, skin(transforms, body.skinning_weights, rest) + place)
+        return locate(
+            points, joints + place, linear_blend_skinning(transforms, body.skinning_weights, rest) + place
+        )
 
     away = (of_landmarks(start) - of_mesh(start)).norm(dim=-1).max()
     assert away < 1e-3, f"landmarks posed alone are {float(away):.4f} m from those of the mesh"

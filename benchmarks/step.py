@@ -30,6 +30,8 @@ from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.body import Pose
 from pipeline.camera import Camera
+from pipeline.composite import over
+from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
 from stages.train.regularisers import unmixed
@@ -189,8 +191,8 @@ class Contestant:
 
 
 def _photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Tensor:
-    image = losses.over(rendering.color, rendering.alpha, background)
-    return 0.8 * losses.l1(image, target) + 0.2 * losses.ssim(image, target)
+    image = over(rendering.color, rendering.alpha, background)
+    return 0.8 * losses.l1(image, target) + 0.2 * ssim_loss(image, target)
 
 
 def _regularisers(decoded: Decoded, posed: Posed) -> Tensor:

@@ -17,15 +17,16 @@ from torch import Tensor
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
 from pipeline.frames import read_frame, read_mask
 from pipeline.job import Job
 from pipeline.keypoints import COUNT, FACE, LEFT_HAND, RIGHT_HAND, read_keypoints
-from pipeline.metrics.image import psnr
-from pipeline.metrics.protocol import composite, interior
+from pipeline.metrics.protocol import interior
+from pipeline.metrics.psnr import psnr
+from pipeline.process import make_results
 from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Rendering, render
 from pipeline.stage import Context
-from pipeline.study import made
 from stages.evaluate.baselines import nearest_frames
 from stages.evaluate.scoring import Scorer
 from stages.train import run as train
@@ -56,7 +57,7 @@ def trained(job: Job, **instead: Path) -> Trained:
         job: whose avatar, and under which settings.
         instead: folders that stand in for upstream stages' published ones.
     """
-    upstream = made(job, job.stages["train"].needs)
+    upstream = make_results(job, job.stages["train"].needs)
     demands = job.stages["train"].demands(job.settings["train"])
     with tempfile.TemporaryDirectory() as folder:
         places = {name: Path(folder) / name for name in ("output", "work")}
@@ -127,7 +128,9 @@ class Clip:
 
     def person(self, frame: int) -> Tensor:
         """What was filmed, the person on black: [H, W, 3]."""
-        return composite(read_frame(self.ingest / "frames", frame), read_mask(self.ingest / "masks", frame))
+        return composite_frame(
+            read_frame(self.ingest / "frames", frame), read_mask(self.ingest / "masks", frame)
+        )
 
     def scores(self, avatar: Avatar, scorer: Scorer) -> dict[str, float]:
         """Each metric's mean over the held-out frames, the person on black."""

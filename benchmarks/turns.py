@@ -23,14 +23,14 @@ from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
 from pipeline.avatar import Avatar
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
 from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.job import open_job
 from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
-from pipeline.metrics.protocol import composite
+from pipeline.process import make_results
 from pipeline.records import read_split
 from pipeline.splat import Gaussians, render
-from pipeline.study import made
 from pipeline.turntable import orbit, visible_extent
 from stages.evaluate.scoring import Scorer
 
@@ -98,7 +98,9 @@ def faces_of(reader: FaceReader, clip: Clip, avatar: Avatar) -> tuple[list[float
 
 def person(clip: Clip, frame: int) -> np.ndarray:
     """The person of a frame on black, [H, W, 3] uint8."""
-    image = composite(read_frame(clip.ingest / "frames", frame), read_mask(clip.ingest / "masks", frame))
+    image = composite_frame(
+        read_frame(clip.ingest / "frames", frame), read_mask(clip.ingest / "masks", frame)
+    )
     return (255 * image).round().byte().numpy()
 
 
@@ -120,7 +122,7 @@ def mean(values: list[float]) -> float:
 def try_way(subject: str, way: str, words: dict[str, str]) -> tuple[Row, np.ndarray]:
     """Trains one way on one subject; its numbers and its sides."""
     job = open_job(subject, parse_request({**words, **WAYS[way]}, subject))
-    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
+    folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
     done = trained(job)
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
     reader = FaceReader(*(job.workspace.assets / asset for asset in ASSETS))

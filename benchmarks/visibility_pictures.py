@@ -16,8 +16,8 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import joint_transforms
 from pipeline.camera import Camera, facing_camera, project
+from pipeline.composite import composite_frame
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.metrics import composite
 from pipeline.records import read_cameras
 from pipeline.splat import Rendering, render
 from pipeline.visibility import body_in_frame
@@ -45,7 +45,7 @@ def unseen_error(subject: Any, trainer: Trainer, folder: Path | None) -> dict[st
     total, pixels = 0.0, 0
     for frame, camera in read_cameras(views / "cameras.parquet").items():
         rendering, seen = _rendered(subject, trainer, frame, camera)
-        truth = composite(read_frame(views / "frames", frame), read_mask(views / "masks", frame))
+        truth = composite_frame(read_frame(views / "frames", frame), read_mask(views / "masks", frame))
         total += float((rendering.color.clamp(0, 1) - truth).abs().mean(-1)[~seen].sum())
         pixels += int((~seen).sum())
     return found | {"outside": total / max(1, pixels)}

@@ -24,7 +24,7 @@ from pipeline.avatar.rows import put, take
 from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.surface import Surface, build_surface, plane_regions
 from pipeline.avatar.triplane import Triplane
-from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms
+from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
 from pipeline.device import autocast, moved
 from pipeline.splat import Gaussians
 
@@ -278,7 +278,7 @@ class Avatar(nn.Module):
             pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
-        means = _transform(blended, shape) + pose.transl
+        means = transform_points(blended, shape) + pose.transl
         if self.residuals_active and decoded.surface.residual:
             with self._autocast():
                 answer = self.residuals(decoded.surface.residual, means, theta, time, rows)
@@ -361,9 +361,10 @@ class Avatar(nn.Module):
         """
         canonical = surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        blended = blend_transforms(transforms, canonical.skinning_weights)
         shape = _rest_shape(canonical, pose)
         return Gaussians(
-            means=_transform(blend_transforms(transforms, canonical.skinning_weights), shape) + pose.transl,
+            means=transform_points(blended, shape) + pose.transl,
             quaternions=surface.rig.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
             colors=torch.sigmoid(surface.pick(self.base_color)),
@@ -401,8 +402,3 @@ def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:
     joints = pose.rotation[1:]
     matrices = roma.rotvec_to_rotmat(joints) - torch.eye(3, device=joints.device)
     return shape + canonical.pose_directions @ matrices.reshape(-1)
-
-
-def _transform(blended: Tensor, points: Tensor) -> Tensor:
-    # A batched 3x3 product is many times slower on a CPU than the sum written out.
-    return (blended[..., :3] * points[:, None, :]).sum(-1) + blended[..., 3]

@@ -26,13 +26,14 @@ from pipeline.body import (
     read_identity,
     read_poses,
 )
+from pipeline.boxes import Box, clip_box
 from pipeline.camera import Camera
 from pipeline.clip.views import View, ViewCache, cropped
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
 from pipeline.keypoints import Keypoints, read_keypoints
-from pipeline.person import Box, person_box
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_split, spread
+from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
+from pipeline.spread import spread_from_start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +101,11 @@ class FittedClip:
 
     def person_box(self, margin: int) -> Box:
         """The box that holds the person in all training frames, and a margin in pixels around it."""
-        return person_box(self.folder, self.split.train, margin)
+        return clip_box(self.folder, self.split.train, margin)
 
     def spread(self, count: int, split: Literal["train", "test"] = "train") -> tuple[int, ...]:
         """At most ``count`` frame numbers, evenly spread over the training or the held-out frames."""
-        return spread(getattr(self.split, split), count)
+        return spread_from_start(getattr(self.split, split), count)
 
 
 def read_fitted_clip(ingest: Path, fit: Path, body: BodyModel | Path) -> FittedClip:

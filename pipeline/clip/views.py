@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.boxes import Box
 from pipeline.camera import Camera
+from pipeline.composite import composite
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
-from pipeline.person import Box
 
 CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are asked for
 
@@ -39,8 +40,7 @@ class View:
 
     def composite(self, background: Tensor) -> Tensor:
         """The person over a plain background, [3] -> [H, W, 3]."""
-        alpha = self.alpha[..., None]
-        return self.color * alpha + (1 - alpha) * background
+        return composite(self.color, self.alpha, background)
 
 
 class ViewCache:
@@ -56,7 +56,7 @@ class ViewCache:
         """Reads nothing yet."""
         self.folder, self.cameras, self.box = folder, cameras, box
         camera = next(iter(cameras.values()))
-        pixels = (box.right - box.left) * (box.bottom - box.top) if box else camera.width * camera.height
+        pixels = box.width * box.height if box else camera.width * camera.height
         self._cached = functools.lru_cache(maxsize=max(1, CACHED_BYTES // (4 * pixels)))(self._pictures)
 
     def __getitem__(self, frame: int) -> View:
@@ -83,12 +83,11 @@ class ViewCache:
             )
         if box is None:
             return color, alpha
-        rows, columns = slice(box.top, box.bottom), slice(box.left, box.right)
-        return np.ascontiguousarray(color[rows, columns]), np.ascontiguousarray(alpha[rows, columns])
+        return np.ascontiguousarray(color[box.slices]), np.ascontiguousarray(alpha[box.slices])
 
 
 def cropped(camera: Camera, box: Box | None) -> Camera:
     """The camera of a box of the picture; the camera itself for None."""
     if box is None:
         return camera
-    return camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
+    return camera.cropped(box.left, box.top, box.width, box.height)

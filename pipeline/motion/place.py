@@ -14,9 +14,9 @@ from pipeline.body import (
     Pose,
     joint_index,
     joint_transforms,
+    linear_blend_skinning,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.motion.legs import leg_of
 from pipeline.motion.record import Motion
@@ -92,5 +92,7 @@ def lowest_point(body: BodyModel, identity: Identity, rotation: Tensor, transl: 
     for start in range(0, len(rotation), _CHUNK):
         some = slice(start, start + _CHUNK)
         transforms = joint_transforms(rotation[some], joints, body.parents)
-        lowest.append(float((skin(transforms, weights, points)[..., 1] + transl[some, None, 1]).min()))
+        lowest.append(
+            float((linear_blend_skinning(transforms, weights, points)[..., 1] + transl[some, None, 1]).min())
+        )
     return min(lowest)

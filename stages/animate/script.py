@@ -13,6 +13,7 @@ from pipeline.camera import Camera, facing_camera
 from pipeline.motion.place import Placed
 from pipeline.motion.record import Motion
 from pipeline.splat import Gaussians
+from pipeline.spread import spread_end_to_end
 from pipeline.turntable import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
 from stages.animate.settings import AnimateSettings
 
@@ -93,8 +94,8 @@ def cameras_of(
         return [clip_camera(origin, pelvis, *size)] * count
     if script.still:
         return orbit(visible_extent(posed(0)), *size, count, settings.turns)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int))
-    boxes = np.stack([visible_box(posed(int(row))) for row in rows])
+    rows = spread_end_to_end(range(count), _SAMPLES)
+    boxes = np.stack([visible_box(posed(row)) for row in rows])
     if settings.camera == "orbit":
         return orbit(extent_of(boxes), *size, count, settings.turns)
     return [front_camera(boxes, *size)] * count

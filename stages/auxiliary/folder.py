@@ -27,6 +27,7 @@ from pipeline.errors import UserError
 from pipeline.keypoints import COUNT
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
 from pipeline.records import read_cameras, read_json
+from pipeline.spread import spread_from_start
 from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.turn import ID_OFFSET, Turn
 
@@ -169,10 +170,7 @@ def _fitted(images: list[np.ndarray], turn: Turn) -> Iterator[Picture]:
 
 def _places(count: int, turn: Turn) -> list[tuple[int, int]]:
     """Which picture shows which frame of the turn: all of it, or evenly spread."""
-    frames = turn.poses.frames
-    if count >= len(frames):
-        return [(place, frame) for place, frame in enumerate(frames)]
-    return [(place, frames[place * len(frames) // count]) for place in range(count)]
+    return list(enumerate(spread_from_start(turn.poses.frames, count)))
 
 
 def _cameras(turn: Turn) -> dict[int, Camera]:

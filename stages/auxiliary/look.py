@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from pipeline.boxes import Box
 from pipeline.clip import FittedClip
 from pipeline.detection.estimator import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels
@@ -86,8 +87,8 @@ class Watcher:
         if float((high - low).max()) < SMALLEST_FACE:
             return None
         room = FACE_ROOM * float((high - low).max())
-        box = tuple(int(value) for value in (*(low - room), *(high + room)))
-        found = self._faces.read(image, box)  # type: ignore[arg-type]
+        box = Box(*(int(value) for value in (*(low - room), *(high + room))))
+        found = self._faces.read(image, box)
         return found.embedding if found else None
 
     def subject(self, clip: FittedClip) -> np.ndarray | None:

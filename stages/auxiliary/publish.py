@@ -12,9 +12,12 @@ import torch
 from pipeline.body import posed_vertices, write_poses
 from pipeline.camera import Camera
 from pipeline.clip import FittedClip
+from pipeline.composite import composite
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
 from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.pictures import side_by_side
 from pipeline.records import write_cameras, write_json
+from pipeline.spread import spread_from_start
 from stages.auxiliary.accept import Accepted
 from stages.auxiliary.crop import Framing, crop
 from stages.auxiliary.texture import FineSurface
@@ -77,8 +80,7 @@ def publish(
             progress.advance()
     write_records(context, accepted, cameras, refused)
     if sheet:
-        chosen = [sheet[k * len(sheet) // min(_SHEET, len(sheet))] for k in range(min(_SHEET, len(sheet)))]
-        write_png(output / "preview.png", side_by_side(chosen))
+        write_png(output / "preview.png", side_by_side(spread_from_start(sheet, _SHEET)))
 
 
 def write_records(
@@ -127,14 +129,8 @@ def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
 
 def tile(image: np.ndarray, mask: np.ndarray, trust: np.ndarray) -> np.ndarray:
     """A frame for the contact sheet: the person on grey, and below it what is learnt from it."""
-    alpha = mask[..., None] / np.float32(255)
-    person = image * alpha + 208 * (1 - alpha)
+    person = composite(image, mask / np.float32(255), 208.0)
     learnt = person * (0.25 + 0.75 * trust[..., None] / np.float32(255))
     both = np.concatenate([person, learnt]).astype(np.uint8)
     scale = 2 * _TILE / both.shape[0]
     return cv2.resize(both, (max(1, round(both.shape[1] * scale)), 2 * _TILE), interpolation=cv2.INTER_AREA)
-
-
-def side_by_side(tiles: list[np.ndarray]) -> np.ndarray:
-    """Tiles of equal height in a row."""
-    return np.concatenate(tiles, axis=1)

@@ -17,11 +17,11 @@ from pipeline.body import (
     Landmarks,
     Poses,
     joint_transforms,
+    linear_blend_skinning,
     locate,
     posed_joints,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.body.joints import BODY_POSE
 from pipeline.camera import Camera, project
@@ -80,7 +80,7 @@ def register(
     for _ in range(STEPS):
         rotation, transl = posed()
         transforms = joint_transforms(rotation, joints, clip.body.parents)
-        vertices = skin(transforms, weights, rest) + transl[:, None]
+        vertices = linear_blend_skinning(transforms, weights, rest) + transl[:, None]
         places = locate(
             compact, posed_joints(rotation, joints, clip.body.parents) + transl[:, None], vertices
         )

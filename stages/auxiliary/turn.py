@@ -15,6 +15,7 @@ from pipeline.body import JOINT_NAMES, Poses, posed_vertices, rest_joints
 from pipeline.camera import Camera, facing_camera
 from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.errors import UserError
+from pipeline.spread import spread_end_to_end
 from stages.auxiliary.settings import AuxiliarySettings
 
 ID_OFFSET = 100_000
@@ -97,8 +98,8 @@ def _placed(clip: FittedClip, poses: Poses, settings: AuxiliarySettings) -> tupl
     """The camera, and where the pelvis has to be before it: [3]."""
     width, height = settings.width, settings.height
     focal = height / 2 / math.tan(_FIELD / 2)
-    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).round().astype(int))
-    vertices = torch.cat([posed_vertices(clip.body, clip.identity, poses.pose(int(row))) for row in rows])
+    some = [poses.pose(frame) for frame in spread_end_to_end(poses.frames, 24)]
+    vertices = torch.cat([posed_vertices(clip.body, clip.identity, pose) for pose in some])
     low, high = vertices.amin(0), vertices.amax(0)
     middle = torch.stack([torch.zeros(()), (low[1] + high[1]) / 2, torch.zeros(())])
     away = (vertices - middle).abs()

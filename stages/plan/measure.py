@@ -16,11 +16,11 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import PARTS, pose_body
+from pipeline.boxes import MARGIN
 from pipeline.camera import Camera, project, to_camera
 from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.person import MARGIN
 from pipeline.plan import AZIMUTH_STEP
 from pipeline.records import read_json
 from pipeline.tables import read_table

@@ -11,7 +11,7 @@ from pipeline.curves import Curve
 from pipeline.device import moved
 from pipeline.guard import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
-from pipeline.metrics.image import psnr
+from pipeline.metrics.psnr import psnr
 from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore

@@ -11,8 +11,9 @@ from torch import Tensor
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.body import Pose
 from pipeline.clip import View
+from pipeline.composite import over
 from pipeline.device import moved
-from pipeline.metrics import Lpips
+from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
 from stages.train.data import TrainingData
@@ -150,13 +151,13 @@ class Objective:
     def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
         """L1, SSIM and LPIPS between rendering and frame, both over the drawn background."""
         settings = self.settings
-        image = losses.over(rendering.color, rendering.alpha, draw.background)
+        image = over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
         if view.trust is not None:
             image = losses.blend_to_target(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
-        terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}
+        terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * ssim_loss(image, target)}
         if self.network is not None and lpips and self._lpips_due(draw):
             place = crop(view.alpha, settings.lpips_crop, draw.place)
             # As many times the weight, so that its mean over the run is that of a term of every frame.

@@ -18,8 +18,8 @@ from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
 from pipeline.plan import read_plan
-from pipeline.records import spread
 from pipeline.settings import as_dict
+from pipeline.spread import spread_from_start
 from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.apply_plan import apply_plan
@@ -31,6 +31,7 @@ from stages.train.loop import Trainer, describe, point_values
 from stages.train.poses import PoseRefinement
 from stages.train.score_picture import score_picture
 from stages.train.settings import TrainSettings
+from stages.train.step_costs import step_costs
 from stages.train.timer import TrainingTimer
 from stages.train.visibility_gate import VisibilityGate, ever_in_frame, write_ungated
 
@@ -105,7 +106,7 @@ def prepare(
     avatar.pose_heads_active = avatar.residuals_active = False
     set_time_range(avatar, data)
     if settings.initial_color or settings.face:
-        chosen, made = (spread(frames, settings.color_frames) for frames in data.sources)
+        chosen, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
         logits = initial_color_logits(avatar.eval(), refinement, data, chosen, made)
         if settings.face:
             data = dataclasses.replace(data, texture=torch.sigmoid(logits))
@@ -166,8 +167,8 @@ def train(trainer: Trainer, context: Context, compiled: CompileTimer) -> None:
     if trainer.untrained is None:
         with timer.paused():
             trainer.untrained = trainer.held_out(watched)
-    with context.progress(settings.iterations, "training") as progress:
-        progress.advance(trainer.iteration)
+    with context.progress(settings.iterations, "training", step_costs(trainer)) as progress:
+        progress.skip(trainer.iteration)
         while trainer.iteration < settings.iterations:
             values = trainer.step()
             last = trainer.iteration == settings.iterations

@@ -13,12 +13,12 @@ from pipeline.body import (
     Identity,
     Pose,
     joint_transforms,
+    linear_blend_skinning,
     load_body,
     mean_identity,
     pose_body,
     rest_joints,
     rest_vertices,
-    skin,
     uniform_laplacian,
     vertex_normals,
 )
@@ -108,13 +108,13 @@ def test_weights_that_nearly_sum_to_one_are_divided_by_their_sum(tmp_path):
 
 
 def test_weights_that_do_not_sum_to_one_scale_about_the_origin_and_stay_finite(body):
-    """``skin`` itself takes any weights: a sum of 0.5 draws a point half-way to the world's origin."""
+    """Skinning itself takes any weights: a sum of 0.5 draws a point half-way to the world's origin."""
     joints = rest_joints(body, mean_identity(body))
     transforms = joint_transforms(random_pose(0.5, 1), joints, body.parents)
-    whole = skin(transforms, body.skinning_weights, body.v_template)
-    half = skin(transforms, 0.5 * body.skinning_weights, body.v_template)
+    whole = linear_blend_skinning(transforms, body.skinning_weights, body.v_template)
+    half = linear_blend_skinning(transforms, 0.5 * body.skinning_weights, body.v_template)
     torch.testing.assert_close(half, 0.5 * whole)
-    assert not skin(transforms, 0 * body.skinning_weights, body.v_template).any()
+    assert not linear_blend_skinning(transforms, 0 * body.skinning_weights, body.v_template).any()
 
 
 def test_subdivided_weights_still_sum_to_one(body):

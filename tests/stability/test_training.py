@@ -12,7 +12,7 @@ from pipeline.body import load_body
 from pipeline.errors import UserError
 from pipeline.frames import frame_path, write_frame, write_mask
 from pipeline.guard import NotFiniteError
-from stages.train import losses, schedule
+from stages.train import losses, objective, schedule
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, read_checkpoint
 from stages.train.divergence import require_progress
@@ -175,7 +175,7 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
 
 def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
     trainer = trainer_for(context_for(subject, tmp_path / "out", batch=2))
-    monkeypatch.setattr(losses, "ssim", lambda image, target: losses.l1(image, target) * float("nan"))
+    monkeypatch.setattr(objective, "ssim_loss", lambda image, target: losses.l1(image, target) * float("nan"))
     with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d;"):
         trainer.step()
 

@@ -11,7 +11,6 @@ from pipeline.camera import facing_camera
 from pipeline.clip import read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
-from pipeline.person import WINDOW
 from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
 from pipeline.records import Split, read_footage, write_footage, write_json, write_split
 from pipeline.settings import command_line_layer, resolve
@@ -20,7 +19,6 @@ from stages.ingest.cameras.motion import MOVING
 from stages.plan import decide, measure
 from stages.plan.run import run
 from stages.plan.settings import PlanSettings
-from stages.train import losses
 from tests.stages.train_subject import BODY_FILE, FRAMES, write_subject
 
 AZIMUTH_CASES = [
@@ -165,7 +163,6 @@ def test_there_is_a_setting_for_each_decision():
 
 def test_numbers_that_stand_in_two_places_agree():
     assert decide.BACKGROUND_MOTION == MOVING
-    assert losses.WINDOW == WINDOW
 
 
 @pytest.mark.parametrize(("degrees", "widest", "count"), AZIMUTH_CASES)

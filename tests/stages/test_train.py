@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,12 +11,10 @@ from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
 from pipeline.clip import read_fitted_clip
 from pipeline.errors import UserError
-from pipeline.frames import write_mask
-from pipeline.person import person_box
 from pipeline.plan import read_plan
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import losses
+from stages.train import losses, objective
 from stages.train import run as stage
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
@@ -235,7 +232,7 @@ def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_
         calls.append(1)
         return losses.l1(image, target) * (float("nan") if len(calls) == 3 else 1)
 
-    monkeypatch.setattr(losses, "ssim", poisoned)
+    monkeypatch.setattr(objective, "ssim_loss", poisoned)
     with pytest.raises(UserError, match="loss term 'ssim' is nan at iteration 2"):
         stage.run(context)
     assert not list(context.output.iterdir())
@@ -285,24 +282,6 @@ def test_poses_that_cannot_be_used_say_what_to_do(subject, tmp_path, change, mes
     with pytest.raises(UserError, match=message) as caught:
         stage.run(altered(subject, tmp_path / "altered", change))
     assert "fit" in str(caught.value)
-
-
-def test_masks_without_anybody_say_so(subject, tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame in range(3):
-        write_mask(tmp_path / "masks", frame, np.zeros((64, 48), np.uint8))
-    with pytest.raises(UserError, match="nobody"):
-        person_box(tmp_path, (0, 1, 2), 8)
-
-
-def test_person_box_holds_every_mask_and_stays_in_the_frame(tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame, column in enumerate((3, 30)):
-        mask = np.zeros((64, 48), np.uint8)
-        mask[20:60, column : column + 10] = 255
-        write_mask(tmp_path / "masks", frame, mask)
-    box = person_box(tmp_path, (0, 1), 8)
-    assert (box.left, box.top, box.right, box.bottom) == (0, 12, 48, 64)
 
 
 def test_resumed_run_takes_up_the_skinning_weights_where_they_were(subject, tmp_path):

@@ -1,5 +1,7 @@
 """Training off the CPU: with plain torch in the kernels' place, and on a pretended device. No GPU is here."""
 
+import importlib
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from pipeline.body import Pose, load_body
 from pipeline.device import moved
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import initial_colors, loop, losses, objective, visibility_gate
+from stages.train import initial_colors, loop, objective, visibility_gate
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
@@ -32,7 +34,7 @@ def subject(tmp_path_factory):
 
 
 def without_kernels(monkeypatch):
-    for module in (posing, heads, losses):
+    for module in (posing, heads, importlib.import_module("pipeline.metrics.ssim")):
         monkeypatch.setattr(module, "kernels_serve", lambda tensor: False)
 
 
