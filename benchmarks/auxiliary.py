@@ -171,16 +171,15 @@ def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, co
     train, poses = read_split(ingest.folder / "split.json").train, read_poses(fit.folder / "poses.parquet")
     for kind in ("frames", "masks"):
         (folder / kind).mkdir(parents=True)
-    cameras, rows = {}, []
+    cameras, filmed = {}, []
     for number in range(count):
         frame, camera = train[number * len(train) // count], around(scene, 360 * number / count)
         picture = _filmed(scene, frame, camera)
         write_frame(folder / "frames", number, picture.image)
         write_mask(folder / "masks", number, picture.mask)
         cameras[number] = camera
-        rows.append(poses.index(frame))
-    chosen = Poses(tuple(range(count)), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
-    write_poses(folder / "poses.parquet", chosen)
+        filmed.append(poses.pose(frame))
+    write_poses(folder / "poses.parquet", Poses.stack(range(count), filmed))
     write_cameras(folder / "cameras.parquet", cameras)
 
 
@@ -198,8 +197,7 @@ def _scored(
     poses = read_poses(fit.folder / "poses.parquet")
     scores = []
     for frame in read_split(ingest.folder / "split.json").test:
-        row = poses.index(frame)
-        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        gaussians = avatar.gaussians(poses.pose(frame))
         for degrees in UNSEEN if side == "unseen" else (0.0,):
             camera = around(scene, degrees)
             picture = _filmed(scene, frame, camera)

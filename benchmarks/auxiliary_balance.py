@@ -116,10 +116,9 @@ def _scored(
     common = sorted(set(poses.frames) & set(cameras))
     plain, shifted = [], []
     for place, frame in enumerate(spread_from_start(common, FRAMES)):
-        row = poses.index(frame)
         image, mask = read_frame(seen.folder / "frames", frame), read_mask(seen.folder / "masks", frame)
         target = composite_frame(image, mask)
-        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        gaussians = avatar.gaussians(poses.pose(frame))
         made = render(gaussians, cameras[frame]).color.clamp(0, 1)
         part = box_of(mask).slices
         plain.append(psnr(made[part], target[part]))

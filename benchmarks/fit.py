@@ -30,7 +30,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.fit_truth import ANCHORS, SOURCES, Clip, Errors, Stage, load_stage, make_clips, measure
+from benchmarks.fit_truth import ANCHORS, SOURCES, Errors, Stage, TrueClip, load_stage, make_clips, measure
 from pipeline.body import (
     Identity,
     expression_offsets,
@@ -149,7 +149,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 def _clips(
     framing: str, stage: Stage, detectors: tuple[str, ...], quick: bool, bvh: Path | None
-) -> Iterator[Clip]:
+) -> Iterator[TrueClip]:
     """The clips of a framing, as each detector sees them."""
     motions = MOTIONS[framing][: 1 if quick else None]
     if bvh is not None and framing == "full":
@@ -163,7 +163,7 @@ def _clips(
             yield from make_clips(spec, stage, detectors)
 
 
-def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
+def fit(clip: TrueClip, stage: Stage, variant: str, settings: FitSettings) -> Run:
     """Fit one clip and measure it."""
     started = time.perf_counter()
     registration = register(
@@ -179,7 +179,7 @@ def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
 
 
 def _error_table(
-    clips: list[Clip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
+    clips: list[TrueClip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
 ) -> Iterator[str]:
     """Fit the clips of one framing and detector in each variant; append the runs, yield lines."""
     base = FitSettings() if iterations is None else FitSettings(iterations=iterations)
@@ -198,7 +198,7 @@ def _error_table(
 
 
 def _effort_table(
-    clips: list[Clip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
+    clips: list[TrueClip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
 ) -> Iterator[str]:
     """Fit one clip of each framing with every effort; append the runs, yield lines."""
     names = ", ".join(clip.spec.framing for clip in clips)

@@ -251,8 +251,8 @@ def _fitted_points(job: Job, frames: np.ndarray) -> np.ndarray:
         read_poses(folder / "poses.parquet"),
     )
     joints = rest_joints(body, identity)
-    rows = torch.tensor([poses.index(int(frame)) for frame in frames])
-    rotation, transl = poses.rotation[rows], poses.transl[rows][:, None]
+    chosen = poses.select(int(frame) for frame in frames)
+    rotation, transl = chosen.rotation, chosen.transl[:, None]
     transforms = joint_transforms(rotation, joints, body.parents)
     rest = rest_vertices(body, identity)[vertex_ids]
     vertices = linear_blend_skinning(transforms, body.skinning_weights[vertex_ids], rest) + transl
