@@ -28,12 +28,14 @@ from benchmarks import machine
 from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
+from pipeline.boxes import Box, person_box
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask, write_png
 from pipeline.job import Job, open_job, run_stage
-from pipeline.metrics import Lpips, composite, psnr, ssim
+from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.records import read_split, write_cameras
 from pipeline.splat import render
 from stages.ingest.mannequin.footage import Filming
@@ -169,16 +171,15 @@ def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, co
     train, poses = read_split(ingest.folder / "split.json").train, read_poses(fit.folder / "poses.parquet")
     for kind in ("frames", "masks"):
         (folder / kind).mkdir(parents=True)
-    cameras, rows = {}, []
+    cameras, filmed = {}, []
     for number in range(count):
         frame, camera = train[number * len(train) // count], around(scene, 360 * number / count)
         picture = _filmed(scene, frame, camera)
         write_frame(folder / "frames", number, picture.image)
         write_mask(folder / "masks", number, picture.mask)
         cameras[number] = camera
-        rows.append(poses.index(frame))
-    chosen = Poses(tuple(range(count)), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
-    write_poses(folder / "poses.parquet", chosen)
+        filmed.append(poses.pose(frame))
+    write_poses(folder / "poses.parquet", Poses.stack(range(count), filmed))
     write_cameras(folder / "cameras.parquet", cameras)
 
 
@@ -196,14 +197,13 @@ def _scored(
     poses = read_poses(fit.folder / "poses.parquet")
     scores = []
     for frame in read_split(ingest.folder / "split.json").test:
-        row = poses.index(frame)
-        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        gaussians = avatar.gaussians(poses.pose(frame))
         for degrees in UNSEEN if side == "unseen" else (0.0,):
             camera = around(scene, degrees)
             picture = _filmed(scene, frame, camera)
-            target = composite(picture.image, picture.mask)
+            target = composite_frame(picture.image, picture.mask)
             image = render(gaussians, camera).color.clamp(0, 1)
-            part = _box(picture.mask)
+            part = box_of(picture.mask).slices
             pair = image[part], target[part]
             scores.append((psnr(*pair), ssim(*pair), float(network(*pair))))
             if len(scores) <= 3:
@@ -214,13 +214,9 @@ def _scored(
     return tuple(np.mean(scores, axis=0).tolist())  # type: ignore[return-value]
 
 
-def _box(mask: np.ndarray) -> tuple[slice, slice]:
-    """The person's rows and columns with a margin."""
-    parts = []
-    for axis, length in ((1, mask.shape[0]), (0, mask.shape[1])):
-        inside = np.flatnonzero((mask > 127).any(axis))
-        parts.append(slice(max(0, inside[0] - MARGIN), min(length, inside[-1] + 1 + MARGIN)))
-    return parts[0], parts[1]
+def box_of(mask: np.ndarray) -> Box:
+    """The person's box with a margin; the whole picture where nobody is."""
+    return person_box([mask], MARGIN) or Box.whole(mask)
 
 
 def _print(rows: list[Row]) -> None:

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 
 from benchmarks.machine import described, prepare
-from benchmarks.training import Clip, trained
+from benchmarks.training import JudgedClip, trained
 from pipeline.config.request import parse_request
-from pipeline.frames import read_frame, write_png
+from pipeline.frames import write_png
 from pipeline.job import open_job
 from pipeline.metrics import Lpips
 from pipeline.process import make_results
@@ -98,7 +98,7 @@ def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: P
     """Trains one variant on one subject and scores it."""
     job = open_job(subject, parse_request(words, subject))
     folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
-    clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
+    clip = JudgedClip.read(folders["ingest"], folders["fit"], job.workspace.body_file, HELD_OUT)
     scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})
     if variant == NEAREST:
         return with_hands(clip.nearest_scores(scorer)) | {"seconds": 0.0}
@@ -116,11 +116,11 @@ def with_hands(scores: Mapping[str, float]) -> Numbers:
     return {name: both.get(name, math.nan) for name in METRICS}
 
 
-def write_crops(path: Path, clip: Clip, avatar) -> None:
+def write_crops(path: Path, clip: JudgedClip, avatar) -> None:
     """Writes face and hands of the held-out frames, as filmed above the avatar's."""
     rows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for frame in clip.test[:: max(1, len(clip.test) // 3)]:
-        filmed = read_frame(clip.ingest / "frames", frame)
+        filmed = clip.clip.frame(frame)
         shown = (255 * clip.render(avatar, frame).color.clamp(0, 1)).byte().numpy()
         for box in clip.crops(frame).values():
             for row, image in zip(rows, (filmed, shown), strict=True):

@@ -30,15 +30,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.fit_truth import ANCHORS, SOURCES, Clip, Errors, Stage, load_stage, make_clips, measure
+from benchmarks.fit_truth import ANCHORS, SOURCES, Errors, Stage, TrueClip, load_stage, make_clips, measure
 from pipeline.body import (
     Identity,
     expression_offsets,
+    forward_kinematics,
+    linear_blend_skinning,
     locate,
-    matrix_transforms,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.body.landmarks import join
 from pipeline.threads import threads
@@ -149,7 +149,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 def _clips(
     framing: str, stage: Stage, detectors: tuple[str, ...], quick: bool, bvh: Path | None
-) -> Iterator[Clip]:
+) -> Iterator[TrueClip]:
     """The clips of a framing, as each detector sees them."""
     motions = MOTIONS[framing][: 1 if quick else None]
     if bvh is not None and framing == "full":
@@ -163,7 +163,7 @@ def _clips(
             yield from make_clips(spec, stage, detectors)
 
 
-def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
+def fit(clip: TrueClip, stage: Stage, variant: str, settings: FitSettings) -> Run:
     """Fit one clip and measure it."""
     started = time.perf_counter()
     registration = register(
@@ -179,7 +179,7 @@ def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
 
 
 def _error_table(
-    clips: list[Clip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
+    clips: list[TrueClip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
 ) -> Iterator[str]:
     """Fit the clips of one framing and detector in each variant; append the runs, yield lines."""
     base = FitSettings() if iterations is None else FitSettings(iterations=iterations)
@@ -198,7 +198,7 @@ def _error_table(
 
 
 def _effort_table(
-    clips: list[Clip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
+    clips: list[TrueClip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
 ) -> Iterator[str]:
     """Fit one clip of each framing with every effort; append the runs, yield lines."""
     names = ", ".join(clip.spec.framing for clip in clips)
@@ -235,9 +235,13 @@ def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
     def of_mesh(parameters: Parameters) -> Tensor:
         identity = Identity(parameters.betas, parameters.joint_offset, spread @ parameters.face_control)
         rest = rest_vertices(body, identity) + expression_offsets(body, parameters.expression)
-        transforms, joints = matrix_transforms(parameters.matrices, rest_joints(body, identity), body.parents)
+        transforms, joints = forward_kinematics(
+            parameters.matrices, rest_joints(body, identity), body.parents
+        )
         place = parameters.transl[:, None]
-        return locate(points, joints + place, skin(transforms, body.skinning_weights, rest) + place)
+        return locate(
+            points, joints + place, linear_blend_skinning(transforms, body.skinning_weights, rest) + place
+        )
 
     away = (of_landmarks(start) - of_mesh(start)).norm(dim=-1).max()
     assert away < 1e-3, f"landmarks posed alone are {float(away):.4f} m from those of the mesh"

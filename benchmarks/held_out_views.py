@@ -28,6 +28,7 @@ import torch
 from pipeline.artifact import Artifact
 from pipeline.body import (
     joint_transforms,
+    linear_blend_skinning,
     load_body,
     load_landmarks,
     locate,
@@ -36,7 +37,6 @@ from pipeline.body import (
     read_poses,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
@@ -251,11 +251,11 @@ def _fitted_points(job: Job, frames: np.ndarray) -> np.ndarray:
         read_poses(folder / "poses.parquet"),
     )
     joints = rest_joints(body, identity)
-    rows = torch.tensor([poses.index(int(frame)) for frame in frames])
-    rotation, transl = poses.rotation[rows], poses.transl[rows][:, None]
+    chosen = poses.select(int(frame) for frame in frames)
+    rotation, transl = chosen.rotation, chosen.transl[:, None]
     transforms = joint_transforms(rotation, joints, body.parents)
     rest = rest_vertices(body, identity)[vertex_ids]
-    vertices = skin(transforms, body.skinning_weights[vertex_ids], rest) + transl
+    vertices = linear_blend_skinning(transforms, body.skinning_weights[vertex_ids], rest) + transl
     posed = posed_joints(rotation, joints, body.parents) + transl
     return locate(points, posed, vertices).double().numpy()
 

@@ -19,8 +19,8 @@ import pandas as pd
 from pipeline.artifact import MANIFEST
 from pipeline.config.request import Request
 from pipeline.errors import UserError
+from pipeline.run.progress import Progress
 from pipeline.settings import read_toml
-from pipeline.stage import Progress
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import bars
 from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section

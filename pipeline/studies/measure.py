@@ -23,12 +23,14 @@ from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import load_body, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import BACKGROUNDS, BLACK, composite_frame, over
 from pipeline.digest import write_atomically
 from pipeline.frames import read_frame, read_mask
 from pipeline.job import Job
 from pipeline.metrics import Lpips
-from pipeline.metrics.image import psnr, ssim
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK, composite, interior, over
+from pipeline.metrics.protocol import interior
+from pipeline.metrics.psnr import psnr
+from pipeline.metrics.ssim import ssim
 from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Gaussians, render
 from pipeline.studies.variants import Result
@@ -105,7 +107,7 @@ class AvatarMeter:
     def _frame_quality(self, gaussians: Gaussians, frame: int) -> Numbers:
         rendering = render(gaussians, self.cameras[frame])
         mask = read_mask(self.ingest / "masks", frame)
-        person = partial(composite, read_frame(self.ingest / "frames", frame), mask)
+        person = partial(composite_frame, read_frame(self.ingest / "frames", frame), mask)
 
         def picture(background: str) -> torch.Tensor:
             return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)
@@ -126,9 +128,7 @@ class AvatarMeter:
 
         @torch.no_grad()
         def posed(frame: int) -> Gaussians:
-            row = poses.index(frame)
-            pose = poses.rotation[row], poses.expression[row], poses.transl[row]
-            return baked.gaussians(*pose, self.seconds.get(frame))
+            return baked.gaussians(poses.pose(frame), self.seconds.get(frame))
 
         return posed
 

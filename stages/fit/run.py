@@ -28,12 +28,13 @@ from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.records import read_cameras, read_footage, write_json
+from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context
 from pipeline.tables import write_table
 from pipeline.threads import threads
 from stages.fit.initial_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
-from stages.fit.overlay import overlays, sheet, sheet_rows
+from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
 from stages.fit.smoothing import smooth
 
@@ -156,7 +157,7 @@ def write_overlays(
 ) -> None:
     """Write ``overlay.mp4``, every frame, and ``overlay.png``, a contact sheet."""
     ingest = context.inputs["ingest"]
-    wanted, kept = sheet_rows(len(poses)), {}
+    wanted, kept = spread_end_to_end(range(len(poses)), SHEET_FRAMES), {}
     opacity = context.settings.overlay_opacity
 
     def drawing() -> Iterator[np.ndarray]:

@@ -36,7 +36,7 @@ QUICK = FitSettings(iterations=100)
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
+class DetectedClip:
     """Detections, and the poses and joints [T, 55, 3] behind them."""
 
     keypoints: Keypoints
@@ -65,7 +65,7 @@ def true_poses(frames: tuple[int, ...], distance: float = 3.0) -> Poses:
     return Poses(frames, rotation, torch.zeros(count, 1), transl)
 
 
-def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> Clip:
+def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> DetectedClip:
     """The clip; the hands are never detected, the face only if asked for."""
     frames = tuple(range(3, 3 + gap * count, gap))
     poses = true_poses(frames)
@@ -87,10 +87,10 @@ def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bo
         pose_world=np.concatenate([world.numpy(), np.ones((count, 33, 1), np.float32)], -1),
         face_mesh=seen(landmarks.face_mesh) if face else blank.face_mesh,
     )
-    return Clip(keypoints, dict.fromkeys(frames, camera), poses, joints)
+    return DetectedClip(keypoints, dict.fromkeys(frames, camera), poses, joints)
 
 
-def whole_body(clip: Clip, body, landmarks: Landmarks) -> Clip:
+def whole_body(clip: DetectedClip, body, landmarks: Landmarks) -> DetectedClip:
     """The same clip as the 133 points alone, as an mmpose file gives them."""
     vertices, joints = pose_body(
         body, mean_identity(body), clip.poses.rotation, clip.poses.expression, clip.poses.transl
@@ -103,7 +103,7 @@ def whole_body(clip: Clip, body, landmarks: Landmarks) -> Clip:
 
 
 def problem_of(
-    model: tuple[BodyModel, Landmarks], clip: Clip, betas: int = 4
+    model: tuple[BodyModel, Landmarks], clip: DetectedClip, betas: int = 4
 ) -> tuple[Objective, Parameters, frozenset[str]]:
     """Objective, initial parameters and frozen groups, as the registration makes them without a face."""
     body, landmarks = model

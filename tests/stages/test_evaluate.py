@@ -15,9 +15,10 @@ from pipeline.errors import UserError
 from pipeline.frames import write_mask, write_png
 from pipeline.metrics import PSNR_CAP
 from pipeline.splat import read_ply
+from pipeline.spread import spread_end_to_end
 from pipeline.turntable import relaxed_pose
 from stages.evaluate import STAGE, curve, records
-from stages.evaluate.evidence import evenly, read_evidence
+from stages.evaluate.evidence import read_evidence
 from stages.evaluate.run import evaluate, report_place
 from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
@@ -85,7 +86,7 @@ def test_every_frame_has_a_row(published):
     cuts = [f"psnr_{background}_{mask}" for background in ("black", "white") for mask in ("own", "truth")]
     assert held_out == expected | {(frame, "avatar", cut) for frame in TEST for cut in cuts}
     trained = {row["frame"] for row in rows if row["split"] == "train"}
-    assert trained == set(evenly([frame for frame in FRAMES if frame not in TEST], 8))
+    assert trained == set(spread_end_to_end([frame for frame in FRAMES if frame not in TEST], 8))
 
 
 def test_summary_holds_the_means_of_the_rows(published):

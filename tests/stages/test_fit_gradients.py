@@ -6,7 +6,7 @@ import pytest
 import roma
 import torch
 
-from pipeline.body import load_body, matrix_transforms
+from pipeline.body import forward_kinematics, load_body
 from stages.fit import terms
 from stages.fit.joint_limits import joint_limits
 from stages.fit.parameters import parameters_of
@@ -63,7 +63,7 @@ def test_gradient_of_six_numbers_a_rotation():
     weights = random(55, 3, 4, seed=3)
 
     def posed(columns):
-        transforms, moved = matrix_transforms(roma.special_gramschmidt(columns), joints, body.parents)
+        transforms, moved = forward_kinematics(roma.special_gramschmidt(columns), joints, body.parents)
         return (transforms * weights).sum((1, 2, 3)), (moved * weights[..., 0]).sum((1, 2))
 
     assert torch.autograd.gradcheck(posed, (six,))

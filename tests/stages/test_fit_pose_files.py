@@ -14,11 +14,11 @@ from pipeline.body import (
     Poses,
     joint_index,
     joint_transforms,
+    linear_blend_skinning,
     pose_body,
     posed_joints,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.camera import facing_camera, to_camera
 from pipeline.keypoints import empty_keypoints
@@ -117,7 +117,7 @@ def as_the_tools_pose(folder, body, hand_mean, name="smplx_params"):
     assert not loaded(fitted / "locator_offset.json").any()
     moved = torch.einsum("vce,te->tvc", body.expression_directions, expression[:, :38])
     transforms = joint_transforms(rotation, joints, body.parents)
-    vertices = skin(transforms, body.skinning_weights, rest + moved)
+    vertices = linear_blend_skinning(transforms, body.skinning_weights, rest + moved)
     trans = columns["trans"][:, None]
     return vertices + trans, posed_joints(rotation, joints, body.parents) + trans
 

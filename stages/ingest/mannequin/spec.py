@@ -13,14 +13,14 @@ from pipeline.settings import SETTINGS, Count, Fraction, FrameRate, Seed, Side
 
 Framing = Literal["full", "upper", "head"]
 Detector = Literal["mediapipe", "heatmap"]
-View = Literal["left", "right", "back", "above"]
+UnseenView = Literal["left", "right", "back", "above"]
 FilmedFrames = Annotated[int, Field(ge=2, le=1_000_000)]
 Noise = Annotated[float, Field(ge=0, le=100)]
 
 FRAMINGS: tuple[Framing, ...] = get_args(Framing)
 DETECTORS: tuple[Detector, ...] = get_args(Detector)
 LAYERS = ("stand", "turn", "sway", "gesture", "curl", "speech", "nod")
-VIEWS: Mapping[View, tuple[float, float]] = {
+VIEWS: Mapping[UnseenView, tuple[float, float]] = {
     "left": (60.0, 0.0), "right": (-60.0, 0.0), "back": (180.0, 0.0), "above": (25.0, 40.0),
 }  # fmt: skip
 """Cameras that the pipeline never sees: azimuth towards the subject's left and elevation, degrees."""
@@ -75,7 +75,7 @@ class MannequinSpec:
     noise: Noise = 1.0
     hand_failures: Fraction = 0.03
     detector: Detector = "mediapipe"
-    views: tuple[View, ...] = ()
+    views: tuple[UnseenView, ...] = ()
     view_stride: Count = 10
 
     @model_validator(mode="after")

@@ -1,6 +1,6 @@
 """Structural similarity and its gradient at once on a CPU.
 
-Its plain twins are torchmetrics and ``plain_ssim`` of the train stage's losses; tests hold them together.
+Its plain twin is ``plain_ssim_loss`` in ``ssim.py``, where the definition stands; tests hold them together.
 
 Four local means are enough: of both images, of the sum of their squares and of their product. The loss is a
 scalar, so its gradient is known but for a factor as soon as its value is: the derivatives with respect to
@@ -26,12 +26,17 @@ MEANS = 4  # of the image, the target, the sum of their squares, their product
 FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # never "nnan" or "ninf": what is not finite must show
 
 
-def fused_ssim(image: Tensor, target: Tensor, window: Tensor, constants: tuple[float, float]) -> Tensor:
+def fused_ssim_loss(
+    image: Tensor,  # [H, W, C]
+    target: Tensor,  # [H, W, C]
+    window: Tensor,  # [11]
+    constants: tuple[float, float],
+) -> Tensor:
     """One minus the mean structural similarity, scalar; only the image gets a gradient.
 
     Args:
-        image, target: [H, W, C] of one dtype, float32 or float64, at least 6 pixels along each side.
-        window: [11], symmetric, adds up to one.
+        image, target: of one dtype, float32 or float64, at least 6 pixels along each side.
+        window: symmetric, adds up to one.
         constants: C1 and C2.
     """
     return _Ssim.apply(image, target, window.to(image), constants)
