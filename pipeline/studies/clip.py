@@ -24,11 +24,11 @@ from pipeline.frames import read_frame, read_mask
 from pipeline.metrics import Lpips
 from pipeline.metrics.image import psnr, ssim
 from pipeline.metrics.protocol import BACKGROUNDS, BLACK, composite, interior, over
+from pipeline.numba_kernels import threads
 from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Gaussians, render
 from pipeline.studies.notes import Notes, Numbers
 from pipeline.study import Outcome
-from pipeline.threads import threads
 
 SIDE = 512  # pixels of the picture that speed is measured at
 REPEATS, POSES = 15, 4  # frames that are timed, and poses that they take in turn

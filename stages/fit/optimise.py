@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters

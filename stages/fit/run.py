@@ -24,10 +24,10 @@ from pipeline.body import (
 from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
 from pipeline.keypoints import read_keypoints
+from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.records import read_cameras, read_footage, write_json
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.fit.overlay import overlays, sheet, sheet_rows
 from stages.fit.pose_given import given_poses, keep_given
 from stages.fit.registration import Registration, register, steps_of, views_of

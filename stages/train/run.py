@@ -17,12 +17,12 @@ from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
+from pipeline.numba_kernels import threads
 from pipeline.person import person_box
 from pipeline.plan import read_plan
 from pipeline.records import Split, read_cameras, read_footage, read_split, spread
 from pipeline.settings import as_dict
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.clock import Clock
 from stages.train.costs import saved

@@ -6,7 +6,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.avatar.sparse import SparsePair
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.train import losses
 
 # A path of three vertices, 0 - 1 - 2.

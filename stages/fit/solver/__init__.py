@@ -15,7 +15,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.objective import Objective
 from stages.fit.optimise import Watch, ignore
 from stages.fit.parameters import PER_FRAME, Parameters
