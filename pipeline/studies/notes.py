@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from pipeline.digest import write_atomically
+from pipeline.json_files import json_text
 
 Numbers = dict[str, float]
 
@@ -31,7 +32,7 @@ class Notes:
         """Notes finite numbers; others are left out."""
         self.folder.mkdir(parents=True, exist_ok=True)
         known = {key: value for key, value in numbers.items() if math.isfinite(value)}
-        write_atomically(self.folder / f"{name}.json", json.dumps(known, indent=1, sort_keys=True) + "\n")
+        write_atomically(self.folder / f"{name}.json", json_text(known))
 
     def once(self, name: str, measure: Callable[[], Mapping[str, float]]) -> Numbers:
         """What is noted under a name, measured now if it is not."""

@@ -12,8 +12,9 @@ import torch
 from pipeline.body import write_poses
 from pipeline.camera import Camera
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.json_files import write_json
 from pipeline.keypoints import empty_keypoints, write_keypoints
-from pipeline.records import write_cameras, write_json
+from pipeline.records import write_cameras
 from stages.auxiliary.accept import Accepted, posed, rows_of
 from stages.auxiliary.crop import Framing, crop
 from stages.auxiliary.texture import FineSurface

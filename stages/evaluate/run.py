@@ -16,10 +16,10 @@ from pipeline.body import BodyModel, load_body, read_identity
 from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import peak_memory, shown
+from pipeline.json_files import write_json
 from pipeline.metrics import Lpips
 from pipeline.metrics.identity import FaceReader
 from pipeline.plan import Plan, read_plan
-from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.stage import Context

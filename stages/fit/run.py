@@ -23,10 +23,11 @@ from pipeline.body import (
 )
 from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
+from pipeline.json_files import write_json
 from pipeline.keypoints import read_keypoints
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import read_cameras, read_footage, write_json
+from pipeline.records import read_cameras, read_footage
 from pipeline.stage import Context
 from stages.fit.overlay import overlays, sheet, sheet_rows
 from stages.fit.pose_given import given_poses, keep_given

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar, Surface
 from pipeline.avatar.canonical import dilate
-from pipeline.records import write_json
+from pipeline.json_files import write_json
 from pipeline.splat import render
 from pipeline.tables import write_table
 from pipeline.visibility import Line, authors_threshold, body_in_frame, evidence_threshold, fixed_threshold

@@ -10,10 +10,11 @@ import torch
 from pipeline.body import load_body
 from pipeline.camera import facing_camera
 from pipeline.errors import UserError
+from pipeline.json_files import write_json
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.person import WINDOW
 from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
-from pipeline.records import Split, read_footage, write_footage, write_json, write_split
+from pipeline.records import Split, read_footage, write_footage, write_split
 from pipeline.settings import command_line_layer, resolve
 from pipeline.tables import write_table
 from stages.ingest.cameras.motion import MOVING
