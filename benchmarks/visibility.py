@@ -27,19 +27,21 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
+from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
-from pipeline.visibility import authors_threshold, evidence_threshold
-from stages.plan.measure import read_clip, visibility
+from pipeline.visibility import evidence_threshold
+from stages.plan.measure import read_inputs, visibility
 from stages.train import run as training
-from stages.train.gate import Gate
+from stages.train.apply_plan import apply_plan
+from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
-from stages.train.obey import obey
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
+from stages.train.visibility_gate import VisibilityGate
 
 SUBJECTS = ("mannequin_full", "mannequin_upper", "mannequin_head", "smile", "oliver", "balance")
 ALL = (*SUBJECTS, "carphone")
@@ -50,7 +52,6 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "late": {"early_gate": False},
     "fixed 0.4": {"gate_threshold": 0.4},
     "fixed 0.6": {"gate_threshold": 0.6},
-    "authors": {"gate_guard": "authors"},
 }
 
 
@@ -61,14 +62,14 @@ class Subject:
     Attributes:
         name: the subject's.
         job: with every stage's settings.
-        inputs: what train reads.
+        data: what train reads.
         plan: of the subject.
         clip: what the plan looked at.
     """
 
     name: str
     job: Job
-    inputs: training.Inputs
+    data: TrainingData
     plan: Plan
     folders: Mapping[str, Path]
 
@@ -79,7 +80,7 @@ def open_subject(name: str) -> Subject:
     Raises:
         UserError: the store has no plan of it under the present settings.
     """
-    job = job_from_words(name, {})
+    job = open_job(name, parse_request({}, name))
     folders = {}
     for stage in ("ingest", "fit", "plan"):
         artifact = job.find(stage)
@@ -90,32 +91,32 @@ def open_subject(name: str) -> Subject:
         settings=TrainSettings(), inputs=folders, body_file=job.workspace.body_file, log=lambda line: None
     )
     plan = read_plan(folders["plan"] / "plan.json")
-    return Subject(name, job, training.read_inputs(context), plan, folders)
+    return Subject(name, job, read_training_data(context), plan, folders)
 
 
 def trainer_of(subject: Subject, settings: TrainSettings, plan: Plan | None = None) -> Trainer:
     """A trainer as the stage makes it."""
-    settings = settings if plan is None else obey(settings, plan)
+    settings = settings if plan is None else apply_plan(settings, plan)
     context = SimpleNamespace(inputs=subject.folders, log=lambda line: None)
-    refinement = PoseRefinement(subject.inputs.poses, subject.inputs.split.train)
-    avatar, texture = training.prepare(subject.inputs, refinement, settings, context)
-    vertices = len(subject.inputs.body.v_template)
-    gate = Gate(avatar, vertices, settings) if settings.gate else None
-    return Trainer(avatar, refinement, subject.inputs.evidence(texture), settings, gate=gate)
+    clip = subject.data.clip
+    refinement = PoseRefinement(clip.poses, clip.split.train)
+    avatar, data = training.prepare(subject.data, refinement, settings, context)
+    vertices = len(clip.body.v_template)
+    gate = VisibilityGate(avatar, vertices, settings) if settings.gate else None
+    return Trainer(avatar, refinement, data, settings, gate=gate)
 
 
 def scored(subject: Subject, trainer: Trainer, frames: tuple[int, ...], network: Lpips) -> dict[str, float]:
     """Held-out PSNR, SSIM and LPIPS of the person on black, and an animation's frame."""
     values: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": [], "animation_ms": []}
     avatar = trainer.avatar.eval()
-    poses = subject.inputs.poses
+    clip = subject.data.clip
     with torch.no_grad():
         for frame in frames:
-            row, view = poses.index(frame), subject.inputs.whole[frame]
-            pose = (poses.rotation[row], poses.expression[row], poses.transl[row])
-            avatar.gaussians(*pose, subject.inputs.times.get(frame))
+            pose, view = clip.pose(frame), subject.data.whole[frame]
+            avatar.gaussians(pose, clip.seconds.get(frame))
             start = time.perf_counter()
-            gaussians = avatar.gaussians(*pose, subject.inputs.times.get(frame))
+            gaussians = avatar.gaussians(pose, clip.seconds.get(frame))
             values["animation_ms"].append(1e3 * (time.perf_counter() - start))
             image, truth = render(gaussians, view.camera).color.clamp(0, 1), view.composite(torch.zeros(3))
             values["psnr"].append(psnr(image, truth))
@@ -152,7 +153,7 @@ def in_turn(trainers: Mapping[str, Trainer], rounds: int) -> dict[str, float]:
 
 def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> list[dict[str, Any]]:
     """Trains every variant of one subject and scores it."""
-    frames = training.spread(subject.inputs.split.test, options.frames)
+    frames = subject.data.clip.spread(options.frames, "test")
     trainers, rows = {}, []
     for name in options.variants:
         forced = name == "forced"
@@ -167,8 +168,9 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
             trainer.step()
         row = {"subject": subject.name, "variant": name, "seconds": time.process_time() - start}
         row |= {"gaussians": len(trainer.avatar), **scored(subject, trainer, frames, network)}
-        line = trainer.gate.line if trainer.gate is not None else None
-        row |= {"tau": line.tau if line else 0.0, "views": unseen_error(subject, trainer, options.figure)}
+        threshold = trainer.gate.threshold if trainer.gate is not None else None
+        row |= {"tau": threshold.tau if threshold else 0.0}
+        row |= {"views": unseen_error(subject, trainer, options.figure)}
         rows.append(row)
         trainers[name] = trainer
         print(f"  {subject.name} {name}: {row['psnr']:.2f} dB, {row['gaussians']} Gaussians", flush=True)
@@ -177,12 +179,11 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
     return rows
 
 
-def lines(subject: Subject) -> dict[str, Any]:
-    """Where our test and the authors' guards draw the line, from fitted poses."""
-    clip = read_clip(subject.folders["ingest"], subject.folders["fit"], subject.inputs.body)
-    scores, _ = visibility(clip)
-    found = {"ours": evidence_threshold(scores), "authors": authors_threshold(scores)}
-    return {"subject": subject.name, **{name: dataclasses.asdict(line) for name, line in found.items()}}
+def threshold_of(subject: Subject) -> dict[str, Any]:
+    """The gate's threshold, from fitted poses."""
+    inputs = read_inputs(subject.folders["ingest"], subject.folders["fit"], subject.job.workspace.body_file)
+    scores, _ = visibility(inputs)
+    return {"subject": subject.name, **dataclasses.asdict(evidence_threshold(scores))}
 
 
 def print_rows(rows: list[dict[str, Any]]) -> None:
@@ -210,16 +211,14 @@ def print_plans(subjects: list[Subject]) -> None:
         print(f"| {effect} | {made[0].threshold:g} {made[0].unit} | {' | '.join(cells)} |")
 
 
-def print_lines(found: list[dict[str, Any]]) -> None:
-    """Where the line is drawn, ours and the authors'."""
-    print("\n| subject | Otsu | eta | mu_0 | ours: tau | cut | lost | authors: tau | cut | lost | why |")
-    print("|---" * 11 + "|")
+def print_thresholds(found: list[dict[str, Any]]) -> None:
+    """The gate's threshold of each subject, and why."""
+    print("\n| subject | Otsu | eta | mu_0 | tau | cut | lost | why |")
+    print("|---" * 8 + "|")
     for one in found:
-        mine, theirs = one["ours"], one["authors"]
-        cells = [f"{mine['otsu']:.2f}", f"{mine['separability']:.2f}", f"{mine['low_mean']:.3f}"]
-        for line in (mine, theirs):
-            cells += [f"{line['tau']:.2f}", f"{line['cut']:.1%}", f"{line['lost']:.2%}"]
-        print(f"| {one['subject']} | {' | '.join(cells)} | {theirs['why']} |")
+        cells = [f"{one['otsu']:.2f}", f"{one['separability']:.2f}", f"{one['low_mean']:.3f}"]
+        cells += [f"{one['tau']:.2f}", f"{one['cut']:.1%}", f"{one['lost']:.2%}"]
+        print(f"| {one['subject']} | {' | '.join(cells)} | {one['why']} |")
 
 
 def headline(rows: list[dict[str, Any]]) -> str:
@@ -265,10 +264,10 @@ def main() -> None:
     prepare("benchmarks.visibility", options.threads)
     print(described())
     subjects = [open_subject(name) for name in options.subjects]
-    result: dict[str, Any] = {"machine": described(), "rows": [], "lines": [], "gradients": {}}
+    result: dict[str, Any] = {"machine": described(), "rows": [], "thresholds": [], "gradients": {}}
     if options.only in (None, "plans"):
-        result["lines"] = [lines(one) for one in subjects]
-        print_lines(result["lines"])
+        result["thresholds"] = [threshold_of(one) for one in subjects]
+        print_thresholds(result["thresholds"])
         print_plans(subjects)
     if options.only in (None, "gradients"):
         for one in subjects:

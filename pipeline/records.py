@@ -86,13 +86,6 @@ class Split:
     test: tuple[int, ...]
 
 
-def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """At most ``count`` of the frames, evenly spread over them; the first is always among them."""
-    if len(frames) <= count:
-        return frames
-    return tuple(frames[place * len(frames) // count] for place in range(count))
-
-
 def write_split(path: Path, split: Split) -> None:
     """Write ``split.json``."""
     write_json(path, {"train": list(split.train), "test": list(split.test)})

@@ -1,28 +1,21 @@
-"""How often each point of the body is seen, and where the line is drawn (paper, Section 3.4).
+"""Visibility scores of the body's vertices and the threshold under which they are gated (paper, Section 3.4).
 
-A score v_i is the share of the frames that show vertex i. The paper draws the line at Otsu's threshold
-tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu
-draws a line all the same, through what is healthy. ``evidence_threshold`` tells the two apart by what a
-line costs; ``authors_threshold`` is the test of the authors' release, for comparison.
+A score v_i is the share of the frames that show vertex i. The paper's threshold is Otsu's tau*, which is
+right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu finds a threshold all
+the same, and cuts what the clip does show. ``evidence_threshold`` tells the two apart by what is lost.
 
 **The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
 frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /
-sum of all scores``. A line is drawn only where
+sum of all scores``. A threshold is used only where
 
 1. ``lost`` is at most ``LARGEST_LOSS``: no more is taken from what the clip shows;
 2. a valley lies there: scores between tau / 2 and 3 tau / 2 are at most ``LARGEST_VALLEY`` of those under
-   tau. This is the paper's own argument for Otsu, that the line could be moved without harm;
+   tau. This is the paper's own argument for Otsu, that the threshold could be moved without harm;
 3. at least ``LEAST_CUT`` of all vertices lie under it, else it is not worth its bookkeeping.
 
-Where Otsu's own line fails, Otsu is asked again about the scores under it, and so on: with three modes
-(legs never, hands now and then, the face always) the first line may cut off the hands, and the second
-one leaves them.
-
-The guards of the authors' release are mu_0 < 0.10, the mean of the lower class; eta >= 0.60, the share of
-the variance that lies between the classes; and 5% to 95% of the vertices under the line. The second one
-stops nothing: a normal distribution has eta = 2 / pi = 0.64 and a uniform one 0.75. The first one does
-the work, and asks for the mean of a class in which never-seen vertices outvote the others: whether hands
-that half of the frames show are cut off then hangs on how many legs are out of the picture.
+Where Otsu's threshold fails, Otsu's of the scores under it is tried, and so on: with three modes (legs
+never, hands now and then, the face always) the first threshold may cut off the hands, and the second one
+leaves them.
 """
 
 from __future__ import annotations
@@ -34,18 +27,17 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Surface
-from pipeline.body import joint_transforms
+from pipeline.body import Pose, joint_transforms
 from pipeline.camera import Camera, project, to_camera
 
 BINS = 256
 NEAR = 0.2  # metres: what is nearer to the camera is not in the picture, as in the authors' release
 LARGEST_LOSS, LARGEST_VALLEY, LEAST_CUT = 0.01, 0.1, 0.05
-LARGEST_LOW_MEAN, LEAST_SEPARABILITY, CUT_RANGE = 0.10, 0.60, (0.05, 0.95)  # the authors' guards
 
 
 @dataclasses.dataclass(frozen=True)
-class Line:
-    """A threshold on scores and what it means.
+class Threshold:
+    """A threshold on scores and what it cuts.
 
     Attributes:
         tau: scores below it are gated; 0 where the gate stays open.
@@ -67,36 +59,35 @@ class Line:
 
     @property
     def closed(self) -> bool:
-        """Whether anything is gated."""
+        """True where anything is gated."""
         return self.tau > 0
 
 
 def in_frame(camera: Camera, points: Tensor) -> Tensor:
-    """Which points lie inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
+    """True for points inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
     pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
     size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype, device=pixels.device)
     return (depth > NEAR) & ((pixels >= 0) & (pixels < size)).all(1)
 
 
 @torch.no_grad()
-def body_in_frame(surface: Surface, rotation: Tensor, transl: Tensor, camera: Camera) -> Tensor:
-    """Which vertices of the posed body lie in the picture, [N] bool.
+def body_in_frame(surface: Surface, pose: Pose, camera: Camera) -> Tensor:
+    """True for vertices of the posed body that lie in the picture, [N] bool.
 
     Expressions and offsets are left out: they move a vertex by less than its distance to the next.
 
     Args:
         surface: of an avatar.
-        rotation: [55, 3] rotation vectors, radians.
-        transl: [3], metres.
+        pose: of the body.
         camera: of the picture.
     """
     canonical = surface.canonical
-    transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
-    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, transl)[0])
+    transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, pose.transl)[0])
 
 
 def histogram(scores: np.ndarray) -> np.ndarray:
-    """How many scores, [V] in [0, 1], lie in each of ``BINS`` equal bins: [256] int64.
+    """The histogram of scores, [V] in [0, 1], over ``BINS`` equal bins: [256] int64.
 
     Raises:
         ValueError: there is no score, or one is no share.
@@ -106,10 +97,10 @@ def histogram(scores: np.ndarray) -> np.ndarray:
     return np.bincount(np.minimum((scores * BINS).astype(np.int64), BINS - 1), minlength=BINS)
 
 
-def otsu(counts: np.ndarray) -> tuple[float, float, float]:
+def otsu_threshold(counts: np.ndarray) -> tuple[float, float, float]:
     """Otsu's threshold of a histogram over [0, 1].
 
-    Where several lines separate equally well, which is so across every gap, the middle one is taken.
+    Where several thresholds separate equally well, which is so across every gap, the middle one is taken.
 
     Args:
         counts: [256], not all zero.
@@ -129,30 +120,30 @@ def otsu(counts: np.ndarray) -> tuple[float, float, float]:
     between = np.zeros(len(low))
     between[inner] = (mean * low[inner] - first[inner]) ** 2 / (low[inner] * (1 - low[inner]))
     best = np.flatnonzero(between >= between.max() * (1 - 1e-6))
-    line = int(best[len(best) // 2])
-    return (line + 1) / len(counts), float(between.max() / variance), float(first[line] / low[line])
+    last = int(best[len(best) // 2])  # bin of the lower class
+    return (last + 1) / len(counts), float(between.max() / variance), float(first[last] / low[last])
 
 
-def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Line:
-    """Where to draw the line, if anywhere, by the test of the module's docstring.
+def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Threshold:
+    """The threshold that passes the test of the module's docstring; an open gate if none does.
 
     Args:
         scores: [V] in [0, 1], of every vertex of the body.
         largest_loss: see there.
     """
-    tau, separability, low_mean = otsu(histogram(scores))
+    tau, separability, low_mean = otsu_threshold(histogram(scores))
     first = tau
     while tau > 0:
-        cut, lost = cost(scores, tau)
+        cut, lost = share_below(scores, tau)
         if cut < LEAST_CUT:
             break
         valley = float(((scores >= tau / 2) & (scores < 1.5 * tau)).mean())
         if lost <= largest_loss and valley <= LARGEST_VALLEY * cut:
             why = f"{cut:.0%} of the body is under {tau:.2f}, and {lost:.2%} of what is seen goes with it"
-            return Line(tau, first, separability, low_mean, cut, lost, why)
-        tau = otsu(histogram(scores[scores < tau]))[0]
-    cut, lost = cost(scores, first)
-    return Line(0.0, first, separability, low_mean, cut, lost, _why_open(first, cut, lost))
+            return Threshold(tau, first, separability, low_mean, cut, lost, why)
+        tau = otsu_threshold(histogram(scores[scores < tau]))[0]
+    cut, lost = share_below(scores, first)
+    return Threshold(0.0, first, separability, low_mean, cut, lost, _why_open(first, cut, lost))
 
 
 def _why_open(tau: float, cut: float, lost: float) -> str:
@@ -163,30 +154,13 @@ def _why_open(tau: float, cut: float, lost: float) -> str:
     return f"a line at {tau:.2f} would take {lost:.1%} of what is seen, and there is no valley under it"
 
 
-def authors_threshold(scores: np.ndarray) -> Line:
-    """Otsu's line, where the guards of the authors' release let it pass."""
-    tau, separability, low_mean = otsu(histogram(scores))
-    cut, lost = cost(scores, tau)
-    failed = [
-        text
-        for fails, text in (
-            (low_mean >= LARGEST_LOW_MEAN, f"mu_0 = {low_mean:.2f}"),
-            (separability < LEAST_SEPARABILITY, f"eta = {separability:.2f}"),
-            (not CUT_RANGE[0] <= cut <= CUT_RANGE[1], f"{cut:.1%} cut"),
-        )
-        if fails
-    ]
-    why = f"open: {', '.join(failed)}" if failed else "mu_0, eta and the cut pass"
-    return Line(0.0 if failed else tau, tau, separability, low_mean, cut, lost, why)
+def fixed_threshold(scores: np.ndarray, tau: float) -> Threshold:
+    """A threshold set by hand."""
+    first, separability, low_mean = otsu_threshold(histogram(scores))
+    return Threshold(tau, first, separability, low_mean, *share_below(scores, tau), "set by hand")
 
 
-def fixed_threshold(scores: np.ndarray, tau: float) -> Line:
-    """A line drawn by hand."""
-    first, separability, low_mean = otsu(histogram(scores))
-    return Line(tau, first, separability, low_mean, *cost(scores, tau), "set by hand")
-
-
-def cost(scores: np.ndarray, tau: float) -> tuple[float, float]:
-    """The share of vertices under a line, and the part of what is seen that goes missing with them."""
+def share_below(scores: np.ndarray, tau: float) -> tuple[float, float]:
+    """The share of vertices under a threshold, and the part of what is seen that goes missing with them."""
     under, total = scores < tau, float(scores.sum())
     return float(under.mean()), float(scores[under].sum()) / total if total else 0.0

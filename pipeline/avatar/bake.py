@@ -9,13 +9,9 @@ neither the triplane nor the body model is needed any more. Posing has no gradie
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
 import roma
-import safetensors
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decoded, pose_features
@@ -23,14 +19,8 @@ from pipeline.avatar.fused import Layers, arranged, arranged_rows, finish
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import encode, time_code
-from pipeline.body import joint_transforms
-from pipeline.errors import UserError
+from pipeline.body import Pose, joint_transforms
 from pipeline.splat import Gaussians
-
-FORMAT = "flexiavatar-baked-1"
-HEADS = ("geometry", "color")
-# Fields that JSON holds.
-PLAIN = ("opacity", "place_frequencies", "time_frequencies", "posed_place", "residual_unit")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,24 +121,20 @@ class BakedAvatar:
     @torch.no_grad()
     def gaussians(
         self,
-        rotation: Tensor,  # [55, 3]
-        expression: Tensor,  # [E]
-        transl: Tensor,  # [3]
+        pose: Pose,
         time: float | None = None,
         theta: Tensor | None = None,  # [54 * 6]
     ) -> Gaussians:
         """The avatar in a pose, world coordinates; as ``Avatar.gaussians``, without gradient.
 
         Args:
-            rotation: [55, 3] rotation vectors, radians.
-            expression: [E].
-            transl: [3], metres.
+            pose: of the body, in the world.
             time: seconds from the clip's start, or None, for the residual colours.
-            theta: what the heads are told of the pose; that of ``rotation`` if None.
+            theta: what the heads are told of the pose; that of ``pose`` if None.
         """
-        constants, theta = self.constants, pose_features(rotation) if theta is None else theta
-        transforms = joint_transforms(rotation[None], constants.joints, self.parents)[0]
-        points = self._rest_shape(rotation, expression)
+        constants, theta = self.constants, pose_features(pose.rotation) if theta is None else theta
+        transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
+        points = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         if self.geometry is not None and self.color is not None:
             normals = self.rig.normals(transforms, points)
@@ -156,12 +142,12 @@ class BakedAvatar:
             points = torch.addcmul(points, change[:, :3], constants.offset_unit)
             log_scale = log_scale + 0.5 * change[:, 3:]
             color_logit = color_logit + self.color(theta, normals)
-        means, quaternions = self.rig.place(transforms, points, transl)
+        means, quaternions = self.rig.place(transforms, points, pose.transl)
         answers = self._residuals(means, theta, time)
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
-            means, quaternions = self.rig.place(transforms, points, transl)
+            means, quaternions = self.rig.place(transforms, points, pose.transl)
         for rows, answer in answers:
             color_logit = color_logit.index_add(0, rows, answer[:, :3])
         scales = constants.scales * log_scale.clamp(*LOG_SCALE_RANGE).exp_()
@@ -173,15 +159,15 @@ class BakedAvatar:
             opacities=torch.full((len(points),), self.opacity),
         )
 
-    def _rest_shape(self, rotation: Tensor, expression: Tensor) -> Tensor:
+    def _rest_shape(self, pose: Pose) -> Tensor:
         """The points before skinning, a copy: [N, 3]."""
         constants = self.constants
-        moved = constants.expressions[..., : len(expression)] @ expression
+        moved = constants.expressions[..., : len(pose.expression)] @ pose.expression
         points = constants.points.index_add(0, constants.expressive, moved)
         if not len(constants.correctives):
             return points
-        pose = (roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)).flatten()
-        return points + (constants.correctives @ pose.to(constants.correctives.dtype)).float()
+        turned = (roma.rotvec_to_rotmat(pose.rotation[1:]) - torch.eye(3)).flatten()
+        return points + (constants.correctives @ turned.to(constants.correctives.dtype)).float()
 
     def _residuals(self, means: Tensor, theta: Tensor, time: float | None) -> list[tuple[Tensor, Tensor]]:
         """Each part's rows and what its head says of them, [M, 3] logits or [M, 6] with moves."""
@@ -262,72 +248,3 @@ def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
         offset_unit=sizes.pose_offset_unit * decoded.surface.pliable,
         joints=canonical.joints,
     )
-
-
-def save_baked(path: Path, baked: BakedAvatar) -> None:
-    """Writes a baked avatar as one safetensors file; equal ones give equal bytes."""
-    tensors = {f"constants.{name}": value for name, value in vars(baked.constants).items()}
-    tensors |= {f"rig.{name}": value for name, value in vars(baked.rig).items()}
-    tensors["time_range"] = baked.time_range
-    heads = {name: getattr(baked, name) for name in HEADS if getattr(baked, name) is not None}
-    for part, residual in baked.residuals.items():
-        tensors[f"residual.{part}.rows"] = residual.rows
-        heads[f"residual.{part}"] = residual.head
-    for name, head in heads.items():
-        layers = enumerate(head.layers.flat())
-        tensors |= {f"{name}.{field}": getattr(head, field) for field in ("products", "condition", "own")}
-        tensors |= {f"{name}.layers.{place}": tensor for place, tensor in layers}
-    header = {
-        "format": FORMAT,
-        "parents": baked.parents,
-        "groups": {name: head.layers.groups for name, head in heads.items()},
-        **{name: getattr(baked, name) for name in PLAIN if name != "residual_unit" or baked.residual_unit},
-    }
-    # One entry only: safetensors writes several in an order of its own, different in each process.
-    save_file(
-        {name: tensor.contiguous() for name, tensor in tensors.items()},
-        path,
-        {"baked": json.dumps(header, sort_keys=True)},
-    )
-
-
-def load_baked(path: Path) -> BakedAvatar:
-    """Reads a baked avatar; neither the avatar's own file nor a body model is needed.
-
-    Raises:
-        UserError: if the file is no baked avatar, or is damaged.
-    """
-    try:
-        with safetensors.safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("baked", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise UserError(f"{path} cannot be read ({error}); bake the avatar again") from error
-    if header.get("format") != FORMAT:
-        raise UserError(f"{path} is not a baked avatar of this version; bake the avatar again")
-    heads = {name: _read_head(tensors, name, groups) for name, groups in header["groups"].items()}
-    parts = [name.removeprefix("residual.") for name in heads if name.startswith("residual.")]
-    return BakedAvatar(
-        constants=Constants(**_under("constants.", tensors)),
-        rig=Rig(**_under("rig.", tensors)),
-        parents=tuple(header["parents"]),
-        geometry=heads.get("geometry"),
-        color=heads.get("color"),
-        residuals={
-            part: BakedResidual(tensors[f"residual.{part}.rows"], heads[f"residual.{part}"]) for part in parts
-        },
-        time_range=tensors["time_range"],
-        **{name: header[name] for name in PLAIN if name in header},
-    )
-
-
-def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose name begins so, by the rest of it."""
-    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
-
-
-def _read_head(tensors: dict[str, Tensor], name: str, groups: int) -> BakedHead:
-    own = _under(f"{name}.", tensors)
-    flat = _under("layers.", own)
-    layers = Layers.from_flat(tuple(flat[str(place)] for place in range(len(flat))), groups)
-    return BakedHead(own["products"], own["condition"], own["own"], layers)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
 from pipeline.avatar.fused_kernels import CHUNKS
-from pipeline.body import vertex_normals
+from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
 from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads
 
@@ -110,30 +110,24 @@ class Rig:
 
 @torch.no_grad()
 def plain_normals(rig: Rig, transforms: Tensor, points: Tensor) -> Tensor:
-    """What ``Rig.normals`` computes, in plain torch."""
+    """The plain twin of ``Rig.normals``."""
     blended = _blended(rig, transforms)
-    return vertex_normals(_carried(blended, points), rig.faces.long())
+    return vertex_normals(transform_points(blended, points), rig.faces.long())
 
 
 @torch.no_grad()
 def plain_place(rig: Rig, transforms: Tensor, points: Tensor, transl: Tensor) -> tuple[Tensor, Tensor]:
-    """What ``Rig.place`` computes, in plain torch."""
+    """The plain twin of ``Rig.place``."""
     blended = _blended(rig, transforms)
     quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ rig.frames)
-    return _carried(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
+    return transform_points(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
 
 
 def _blended(rig: Rig, transforms: Tensor) -> Tensor:
     """The transform that each point is carried with, [N, 3, 4]."""
-    flat, total = transforms.flatten(1), transforms.new_zeros(len(rig.weights), 12)
-    # One joint after the other: [N, K, 12] is large.
-    for weight, joint in zip(rig.weights.unbind(1), rig.joints_of.long().unbind(1), strict=True):
-        total += weight[:, None] * flat[joint]
-    return total.unflatten(1, (3, 4))
-
-
-def _carried(blended: Tensor, points: Tensor) -> Tensor:
-    return (blended[..., :3] * points[:, None]).sum(-1) + blended[..., 3]
+    weights = transforms.new_zeros(len(rig.weights), len(transforms))
+    weights.scatter_(1, rig.joints_of.long(), rig.weights.to(weights))
+    return blend_transforms(transforms, weights)
 
 
 @inline_kernel

@@ -6,13 +6,15 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from pipeline.metrics.protocol import composite
+from pipeline.boxes import Box, person_box
+from pipeline.composite import composite_frame
+from pipeline.spread import spread_end_to_end
 from stages.evaluate.baselines import Baselines, prepare_baselines
-from stages.evaluate.evidence import Evidence, Pose, evenly
+from stages.evaluate.evidence import Evidence, Pose
 from stages.evaluate.judging import Judge
 from stages.evaluate.likeness import Reader, likeness
 from stages.evaluate.mesh import TexturedMesh
-from stages.evaluate.pictures import Closeup, Comparison, closeups, compare, person_box
+from stages.evaluate.pictures import Closeup, Comparison, closeups, compare
 from stages.evaluate.rendering import Animate, render_frame, scored_picture
 from stages.evaluate.scoring import (
     AVATAR,
@@ -71,7 +73,7 @@ class Assessment:
 
 def scored_frames(evidence: Evidence, settings: EvaluateSettings) -> list[tuple[str, int]]:
     """The (split, frame) pairs that are scored: all held out, and some that were trained on."""
-    trained = evenly(evidence.split.train, settings.training_frames)
+    trained = spread_end_to_end(evidence.split.train, settings.training_frames)
     return [(HELD_OUT, frame) for frame in evidence.split.test] + [(TRAINING, frame) for frame in trained]
 
 
@@ -96,7 +98,8 @@ def assess(
         extras: what else is judged, or judges.
     """
     shown, sliding = frames_to_show(evidence, settings), frames_to_slide(evidence, settings)
-    box = person_box([evidence.mask(frame) for frame in {*shown, *sliding}])
+    masks = [evidence.mask(frame) for frame in {*shown, *sliding}]
+    box = person_box(masks) or Box.whole(masks[0])
     extras = extras or Extras()
     panel = _Panel(
         judge=Judge(evidence, scorer, settings.choices),
@@ -135,8 +138,8 @@ def frames_to_slide(evidence: Evidence, settings: EvaluateSettings) -> list[int]
 
 
 def _some(evidence: Evidence, settings: EvaluateSettings, count: int) -> list[int]:
-    frames = evidence.split.test or evenly(evidence.split.train, settings.training_frames)
-    return evenly(frames, count) if count else []
+    frames = evidence.split.test or spread_end_to_end(evidence.split.train, settings.training_frames)
+    return spread_end_to_end(frames, count) if count else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,5 +176,5 @@ class _Panel:
     def _ceiling(self, frame: int) -> list[Score]:
         if frame not in self.extras.second.masks:
             return []
-        second = partial(composite, self.evidence.frame(frame), self.extras.second.masks[frame])
+        second = partial(composite_frame, self.evidence.frame(frame), self.extras.second.masks[frame])
         return self.judge.score(CEILING, self.judge.make(second))

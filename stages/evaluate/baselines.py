@@ -9,7 +9,8 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
-from stages.evaluate.evidence import Evidence, evenly
+from pipeline.spread import spread_end_to_end
+from stages.evaluate.evidence import Evidence
 from stages.evaluate.judging import Judge, On
 from stages.evaluate.mesh import TexturedMesh
 from stages.evaluate.scoring import MEAN, MESH, NEAREST, Picture, Scorer
@@ -96,7 +97,7 @@ def prepare_baselines(
 ) -> Baselines:
     """Takes the mean of the training frames and finds each held-out frame's nearest."""
     frames = evidence.split.train
-    training = evenly(frames, settings.baseline_frames or len(frames))
+    training = spread_end_to_end(frames, settings.baseline_frames or len(frames))
 
     @lru_cache(maxsize=2)
     def mean(background: str) -> Tensor:

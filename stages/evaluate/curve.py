@@ -53,11 +53,11 @@ def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
 
 
 def draw_scores(scores: np.ndarray, tau: float) -> list[str]:
-    """The histogram of visibility scores with the gate's line on it, an SVG; none without scores.
+    """The histogram of visibility scores with the gate's threshold on it, an SVG; none without scores.
 
     Args:
         scores: [V] in [0, 1].
-        tau: the line; 0 for none.
+        tau: the threshold; 0 for none.
     """
     if not scores.any():
         return []

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from pipeline.body.poses import Poses, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import BLACK, composite_frame
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask
 from pipeline.keypoints import Keypoints, read_keypoints
-from pipeline.metrics.protocol import BLACK, composite
 from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
 
 Item = TypeVar("Item")
@@ -93,7 +93,7 @@ class Evidence:
 
     def person(self, index: int, background: str = BLACK) -> Tensor:
         """The person on a background, [H, W, 3] float32 in [0, 1]."""
-        return composite(self.frame(index), self.mask(index), background)
+        return composite_frame(self.frame(index), self.mask(index), background)
 
     def seconds(self, index: int) -> float | None:
         """When the frame was filmed, from the clip's start; None where the source has no clock."""
@@ -138,15 +138,6 @@ def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
         refined=read_poses(inputs["train"] / "poses.parquet"),
         keypoints=read_keypoints(ingest / "keypoints.parquet"),
     )
-
-
-def evenly(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` of the items, evenly spaced, first and last included."""
-    if count >= len(items):
-        return list(items)
-    if count == 1:
-        return [items[len(items) // 2]]
-    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
 
 
 @lru_cache(maxsize=4)

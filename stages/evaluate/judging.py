@@ -9,10 +9,12 @@ from functools import cached_property, partial
 import numpy as np
 from torch import Tensor
 
+from pipeline.boxes import Box
+from pipeline.composite import BACKGROUNDS, BLACK, WHITE, cut_out
 from pipeline.metrics.flicker import flicker
-from pipeline.metrics.image import psnr
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK, WHITE, cut_out, interior, person
-from pipeline.metrics.regions import Box, region_boxes
+from pipeline.metrics.protocol import interior, person
+from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import region_boxes
 from pipeline.protocols import TRUTH, Protocol
 from pipeline.splat import Rendering
 from stages.evaluate.evidence import Evidence

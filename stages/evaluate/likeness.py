@@ -7,10 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.boxes import Box
+from pipeline.composite import to_bytes
 from pipeline.metrics.identity import Face, identity_cosine, identity_distance
-from pipeline.metrics.regions import Box
 from stages.evaluate.judging import Truth
-from stages.evaluate.rendering import to_bytes
 from stages.evaluate.scoring import Picture, Score
 
 ROOM = 0.5  # of the face crop's size, around it, for the face finder
@@ -38,7 +38,8 @@ def likeness(reader: Reader, truth: Truth, pictures: Mapping[str, Picture]) -> l
     boxes = truth.boxes.get("face")
     if not boxes:
         return []
-    box = _wider(boxes[0])
+    face = boxes[0]
+    box = face.widened(round(ROOM * max(face.width, face.height)))
     true = reader.read(to_bytes(truth.picture.image), box)
     if true is None:
         return []
@@ -52,9 +53,3 @@ def likeness(reader: Reader, truth: Truth, pictures: Mapping[str, Picture]) -> l
             scores.append(truth.score(method, "identity_distance", distance))
             scores.append(truth.score(method, "identity_cosine", cosine))
     return scores
-
-
-def _wider(box: Box) -> Box:
-    left, top, right, bottom = box
-    room = round(ROOM * max(right - left, bottom - top))
-    return left - room, top - room, right + room, bottom + room

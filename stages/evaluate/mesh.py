@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, pose_body
 from pipeline.camera import Camera
-from pipeline.metrics.protocol import composite
+from pipeline.composite import composite_frame
 from pipeline.texture import FineSurface, View, fine_surface, gather, paint
 from stages.evaluate.evidence import Evidence, Pose
 
@@ -40,7 +40,7 @@ class TexturedMesh:
         """A background -> the mesh in a pose on it, [H, W, 3] float in [0, 1]."""
         vertices = posed(self._body, self._identity, pose)
         image, mask, _ = paint(camera, self._surface, vertices, self.colors)
-        return lambda background: composite(image, mask, background)
+        return lambda background: composite_frame(image, mask, background)
 
 
 def textured_mesh(

@@ -5,18 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import cv2
 import numpy as np
 from torch import Tensor
 
-from pipeline.metrics.regions import Box
-from stages.evaluate.rendering import to_bytes
+from pipeline.boxes import Box
+from pipeline.composite import to_bytes
+from pipeline.pictures import caption, side_by_side
 
 CLOSEUP = 160  # pixels
-_GAP = 6  # pixels between pictures
-_BAND = 26  # pixels of the caption above a column
-_PAPER = 255
-_INK = (40, 40, 40)
+GAP = 6  # pixels between pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +39,9 @@ class Comparison:
         """Truth, render, error: the order in which they are shown."""
         return self.truth, self.render, self.error
 
-    def cropped(self, box: tuple[int, int, int, int]) -> Comparison:
-        """The same comparison inside (left, top, right, bottom)."""
-        left, top, right, bottom = box
-        cut = (slice(top, bottom), slice(left, right))
-        truth, render, error = (picture[cut] for picture in self.pictures)
+    def cropped(self, box: Box) -> Comparison:
+        """The same comparison inside a box."""
+        truth, render, error = (picture[box.slices] for picture in self.pictures)
         return dataclasses.replace(self, truth=truth, render=render, error=error)
 
 
@@ -86,53 +81,12 @@ def compare(frame: int, truth: Tensor, render: Tensor, gain: float, psnr: float)
     return Comparison(frame, to_bytes(truth), to_bytes(render), to_bytes(error), psnr)
 
 
-def person_box(masks: Sequence[np.ndarray], margin: int = 16) -> tuple[int, int, int, int]:
-    """The box (left, top, right, bottom) around the person in all of the masks, [H, W] uint8.
-
-    The whole image where no mask shows anyone.
-    """
-    seen = np.maximum.reduce(masks) > 127
-    height, width = seen.shape
-    if not seen.any():
-        return 0, 0, width, height
-    rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
-    return (
-        max(0, int(columns[0]) - margin),
-        max(0, int(rows[0]) - margin),
-        min(width, int(columns[-1]) + 1 + margin),
-        min(height, int(rows[-1]) + 1 + margin),
-    )
-
-
 def comparison_sheet(comparisons: Sequence[Comparison], gain: float) -> np.ndarray:
     """``comparison.png``: a row a frame; ground truth, render, error. [H, W, 3] uint8 RGB."""
     width = comparisons[0].truth.shape[1]
-    sheet = [beside([caption(title, width) for title in ("ground truth", "render", f"error x{gain:g}")])]
+    titles = ("ground truth", "render", f"error x{gain:g}")
+    sheet = [side_by_side([caption(title, width) for title in titles], GAP)]
     for one in comparisons:
-        row = beside(one.pictures)
+        row = side_by_side(one.pictures, GAP)
         sheet += [row, caption(f"frame {one.frame}, {one.psnr:.2f} dB", row.shape[1])]
     return np.concatenate(sheet)
-
-
-def resized(picture: np.ndarray, height: int) -> np.ndarray:
-    """The picture at another height, its proportions kept."""
-    width = max(1, round(picture.shape[1] * height / picture.shape[0]))
-    shrinks = height < picture.shape[0]
-    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-
-
-def beside(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures of one height side by side, with a gap of paper between them."""
-    gap = np.full((pictures[0].shape[0], _GAP, 3), _PAPER, np.uint8)
-    parts = [part for picture in pictures for part in (picture, gap)]
-    return np.concatenate(parts[:-1], axis=1)
-
-
-def caption(text: str, width: int) -> np.ndarray:
-    """A band of paper with the text on it, made smaller where it would not fit."""
-    band = np.full((_BAND, width, 3), _PAPER, np.uint8)
-    scale = 0.5
-    (length, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    scale *= min(1.0, max(width - 8, 1) / length)
-    cv2.putText(band, text, (4, _BAND - 9), cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
-    return band

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from pipeline.body import Poses, write_poses
-from pipeline.metrics.image import dissimilarity
-from pipeline.metrics.protocol import BACKGROUNDS, over
+from pipeline.composite import BACKGROUNDS, over
+from pipeline.metrics.ssim import rounded_gaussian_window, ssim_loss
 from pipeline.plan import Plan
 from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
@@ -95,7 +95,8 @@ def frame_loss(evidence: Evidence, animate: Animate, background: str, frame: int
 
 def image_loss(image: Tensor, truth: Tensor, background: float = 0.0) -> Tensor:
     """``0.8 L1 + 0.2 (1 - SSIM)`` of two images [H, W, 3], scalar: what of Equation 9 needs no network."""
-    return L1_WEIGHT * (image - truth).abs().mean() + SSIM_WEIGHT * dissimilarity(image, truth, background)
+    dissimilar = ssim_loss(image, truth, background, rounded_gaussian_window())
+    return L1_WEIGHT * (image - truth).abs().mean() + SSIM_WEIGHT * dissimilar
 
 
 def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Pose | None:

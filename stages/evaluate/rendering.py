@@ -11,7 +11,7 @@ from torch import Tensor
 from pipeline.avatar import Avatar
 from pipeline.avatar.bake import bake
 from pipeline.camera import Camera
-from pipeline.metrics.protocol import BLACK, over
+from pipeline.composite import BLACK, over, to_bytes
 from pipeline.splat import Gaussians, Rendering, render
 from stages.evaluate.evidence import Evidence, Pose
 
@@ -54,8 +54,7 @@ def scored_picture(rendering: Rendering, background: str = BLACK) -> Tensor:
 
 def on_grey(rendering: Rendering) -> np.ndarray:
     """The picture for people: dark hair and a white shirt both stand out; [H, W, 3] uint8 RGB."""
-    image = rendering.color + (1 - rendering.alpha[..., None]) * GREY
-    return to_bytes(image)
+    return to_bytes(over(rendering.color, rendering.alpha, GREY))
 
 
 @torch.no_grad()
@@ -63,8 +62,3 @@ def turn_pictures(gaussians: Gaussians, cameras: list[Camera]) -> Iterator[np.nd
     """What each camera sees on grey, [H, W, 3] uint8 RGB."""
     for camera in cameras:
         yield on_grey(render(gaussians, camera))
-
-
-def to_bytes(image: Tensor) -> np.ndarray:
-    """[H, W, 3] float, clamped to [0, 1] -> uint8."""
-    return (image.clamp(0, 1) * 255).round().byte().numpy()

@@ -13,33 +13,35 @@ import torch
 from pipeline import artifact
 from pipeline.avatar import load_avatar
 from pipeline.body import BodyModel, load_body, read_identity
+from pipeline.boxes import Box, person_box
 from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import peak_memory, shown
 from pipeline.json_files import write_json
 from pipeline.metrics import Lpips
 from pipeline.metrics.identity import FaceReader
+from pipeline.pictures import resized, side_by_side
 from pipeline.plan import Plan, read_plan
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
+from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context
 from pipeline.turntable import orbit, relaxed_pose, visible_extent
 from pipeline.versions import versions
 from stages.evaluate import STAGE
 from stages.evaluate.assessment import Assessment, Extras, assess, scored_frames
 from stages.evaluate.curve import draw_curve, draw_fit, draw_scores
-from stages.evaluate.evidence import Evidence, evenly, read_evidence
+from stages.evaluate.evidence import Evidence, read_evidence
 from stages.evaluate.mesh import TexturedMesh, textured_mesh
 from stages.evaluate.motion import motion_pictures
 from stages.evaluate.omissions import omissions
-from stages.evaluate.pictures import beside, comparison_sheet, person_box, resized
+from stages.evaluate.pictures import GAP, comparison_sheet
 from stages.evaluate.plan_table import plan_rows
 from stages.evaluate.records import (
     Gate,
     StageRecord,
     fit_error,
     fit_seconds,
-    plan_savings,
     read_gate,
     stage_records,
 )
@@ -91,7 +93,7 @@ def make_mesh(context: Context, evidence: Evidence, body: BodyModel) -> Textured
         return None
     start = time.monotonic()
     identity = read_identity(context.inputs["fit"] / "identity.safetensors", body)
-    frames = evenly(evidence.split.train, settings.mesh_frames)
+    frames = spread_end_to_end(evidence.split.train, settings.mesh_frames)
     with context.progress(len(frames), "textured mesh") as progress:
         mesh = textured_mesh(evidence, body, identity, frames, progress.advance)
     context.timing("mesh_seconds", time.monotonic() - start)
@@ -149,7 +151,7 @@ def evaluate(
     write_turntable(context, relaxed)
     write_motion(context, evidence, animate)
     cover = cover_pictures(evidence, animate, assessment, relaxed)
-    write_png(context.output / "cover.png", beside(cover))
+    write_png(context.output / "cover.png", side_by_side(cover, GAP))
     sheet = comparison_sheet(assessment.comparisons, settings.error_gain)
     write_png(context.output / "comparison.png", sheet)
     summary = summarise(context, evidence, assessment, scorer, refinement, gate, extras)
@@ -226,7 +228,7 @@ def gather(
         overlay=(fit / "overlay.mp4", fit / "overlay.png"),
         curve=draw_curve(read_curve(train / "curve.parquet", "run the train stage again")),
         fit_curve=draw_fit(read_curve(fit / "curve.parquet", "run the fit stage again"), fit_seconds(fit)),
-        plan=plan_rows(plan, plan_savings(train)),
+        plan=plan_rows(plan),
         scores=draw_scores(gate.scores, gate.tau),
         gate=gate.why,
         refinement=refinement_cost(context, refinement),
@@ -282,11 +284,12 @@ def cover_pictures(
         Four pictures [H, W, 3] uint8 RGB of one height, the first and the last two of one width.
     """
     frame = assessment.comparisons[len(assessment.comparisons) // 2].frame
-    left, top, right, bottom = person_box([evidence.mask(frame)])
+    mask = evidence.mask(frame)
+    person = (person_box([mask]) or Box.whole(mask)).slices
     posed = on_grey(render_frame(animate, evidence, frame))
     turned = both_sides(relaxed)
-    filmed = evidence.frame(frame)[top:bottom, left:right]
-    return [resized(one, _COVER_HEIGHT) for one in (filmed, posed[top:bottom, left:right], *turned)]
+    filmed = evidence.frame(frame)[person]
+    return [resized(one, _COVER_HEIGHT) for one in (filmed, posed[person], *turned)]
 
 
 @torch.no_grad()
@@ -295,8 +298,8 @@ def both_sides(gaussians: Gaussians) -> list[np.ndarray]:
     views = orbit(visible_extent(gaussians), 480, 640, 9)
     renderings = [render(gaussians, view) for view in (views[-1], views[1])]
     masks = [(rendering.alpha.clamp(0, 1) * 255).byte().numpy() for rendering in renderings]
-    left, top, right, bottom = person_box(masks)
-    return [on_grey(rendering)[top:bottom, left:right] for rendering in renderings]
+    seen = (person_box(masks) or Box.whole(masks[0])).slices
+    return [on_grey(rendering)[seen] for rendering in renderings]
 
 
 def describe_clip(evidence: Evidence) -> str:

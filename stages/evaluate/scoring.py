@@ -12,12 +12,13 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
+from pipeline.boxes import Box
+from pipeline.composite import BACKGROUNDS, BLACK
 from pipeline.guard import require_finite
-from pipeline.metrics.image import PSNR_CAP, psnr, ssim
 from pipeline.metrics.intervals import Interval, interval
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK
-from pipeline.metrics.regions import Box
+from pipeline.metrics.psnr import PSNR_CAP, psnr
+from pipeline.metrics.ssim import ssim
 from pipeline.tables import write_table
 from stages.evaluate.settings import EvaluateSettings
 
@@ -145,7 +146,7 @@ class Scorer:
 
     def crops(self, picture: Picture, boxes: Iterable[Box]) -> list[Picture]:
         """Parts of a picture, each made ready by itself."""
-        parts = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in boxes]
+        parts = [box.slices for box in boxes]
         return [self.picture(picture.image[part], picture.black[part]) for part in parts]
 
     @torch.no_grad()

@@ -23,7 +23,8 @@ import numpy as np
 
 from pipeline.detection.estimator import Estimator, estimator_scale, resize
 from pipeline.errors import UserError
-from stages.evaluate.evidence import Evidence, evenly
+from pipeline.spread import spread_end_to_end
+from stages.evaluate.evidence import Evidence
 from stages.evaluate.settings import EvaluateSettings
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def second_masks(context: Context, evidence: Evidence) -> SecondMasks:
     """
     settings: EvaluateSettings = context.settings
     held_out = evidence.split.test
-    frames = evenly(held_out, settings.second_mask_frames or len(held_out))
+    frames = spread_end_to_end(held_out, settings.second_mask_frames or len(held_out))
     if settings.second_mask == "off" or not frames:
         return NONE
     if settings.second_mask == "edge":

@@ -20,12 +20,15 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, edges, rasterize, read_identity, read_poses
 from pipeline.camera import Camera
+from pipeline.composite import BACKGROUNDS, BLACK, composite_frame
 from pipeline.frames import read_frame, read_mask
-from pipeline.metrics.image import psnr, ssim
-from pipeline.metrics.protocol import BACKGROUNDS, BLACK, composite, interior, person
+from pipeline.metrics.protocol import interior, person
+from pipeline.metrics.psnr import psnr
+from pipeline.metrics.ssim import ssim
 from pipeline.records import read_cameras
 from pipeline.splat import render
-from stages.evaluate.evidence import Evidence, evenly
+from pipeline.spread import spread_end_to_end
+from stages.evaluate.evidence import Evidence
 from stages.evaluate.judging import On
 from stages.evaluate.mesh import TexturedMesh, posed
 from stages.evaluate.rendering import Animate, scored_picture
@@ -73,7 +76,7 @@ def read_filmed(evidence: Evidence, body: BodyModel) -> Filmed | None:
     poses = read_poses(evidence.folder / "truth_poses.parquet")
     filmed = Filmed(body, surface, poses, np.zeros(len(body.v_template), bool))
     faces = body.faces.numpy()
-    for frame in evenly(evidence.split.train, LOOKED_AT):
+    for frame in spread_end_to_end(evidence.split.train, LOOKED_AT):
         shown = filmed.raster(evidence.cameras[frame], frame).face
         filmed.seen[faces[np.unique(shown[shown >= 0])]] = True
     # A face smaller than a pixel may be missed: what touches seen surface counts as seen.
@@ -97,11 +100,11 @@ def score_views(
     scores: list[Score] = []
     for folder in view_folders(evidence):
         cameras = read_cameras(folder / "cameras.parquet")
-        frames = evenly([frame for frame in sorted(cameras) if frame in evidence.cameras], FRAMES)
+        frames = spread_end_to_end([frame for frame in sorted(cameras) if frame in evidence.cameras], FRAMES)
         for frame, camera in ((frame, cameras[frame]) for frame in frames):
             unseen = filmed.unseen_pixels(camera, frame) if filmed is not None else None
             image, mask = read_frame(folder / "frames", frame), read_mask(folder / "masks", frame)
-            truth = partial(composite, image, mask)
+            truth = partial(composite_frame, image, mask)
             for method, on in _shown(evidence, animate, mesh, camera, frame):
                 values = _values(on, truth, mask, unseen, background)
                 scores += [Score(frame, VIEWS, method, *value, folder.name) for value in values.items()]

@@ -11,15 +11,15 @@ from pipeline.curves import Curve
 from pipeline.device import moved
 from pipeline.guard import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
-from pipeline.metrics.image import psnr
+from pipeline.metrics.psnr import psnr
 from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
-from stages.train.data import Frames
-from stages.train.gate import Gate
-from stages.train.objective import Evidence, Objective
+from stages.train.data import TrainingData
+from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
+from stages.train.visibility_gate import VisibilityGate
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
@@ -41,24 +41,24 @@ class Trainer:
         self,
         avatar: Avatar,
         poses: PoseRefinement,
-        evidence: Evidence,
+        data: TrainingData,
         settings: TrainSettings,
         network: Lpips | None = None,
-        gate: Gate | None = None,
+        gate: VisibilityGate | None = None,
     ):
         """Starts at iteration 0.
 
         Args:
             avatar: untrained.
             poses: fitted.
-            evidence: the training frames.
+            data: the training frames.
             settings: of the stage.
             network: LPIPS, if it has a weight.
             gate: counts what is seen, and gates the rest; None leaves all of the avatar active.
         """
         self.avatar, self.poses, self.settings, self.gate = avatar, poses, settings, gate
-        self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
-        self.objective.watch = None if gate is None else gate.watch
+        self.data, self.objective = data, Objective(avatar, poses, data, settings, network)
+        self.objective.on_frame = None if gate is None else gate.count
         self.curve, self.iteration = Curve(), 0
         self.untrained: float | None = None
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
@@ -106,7 +106,7 @@ class Trainer:
         fine = schedule.reached(self.settings, self.settings.subdivide_from, self.iteration)
         return self.settings.subdivisions if fine else 0
 
-    def held_out(self, views: Frames, frames: tuple[int, ...]) -> float:
+    def held_out(self, frames: tuple[int, ...]) -> float:
         """Mean PSNR of the person on black in uncropped frames, at their fitted poses, dB.
 
         Of the level of subdivision that is trained now: the finer one is not ready before its time.
@@ -115,15 +115,15 @@ class Trainer:
         with torch.no_grad():
             decoded = self.avatar.decode(self.level)
             for frame in frames:
-                view, pose = moved(views[frame], self.avatar.device), self.poses.fitted(frame)
-                time = self.evidence.times.get(frame)
-                posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, time=time)
+                view, pose = moved(self.data.whole[frame], self.avatar.device), self.poses.fitted(frame)
+                time = self.data.clip.seconds.get(frame)
+                posed = self.avatar.pose(decoded, pose, time=time)
                 color = render(posed.gaussians, view.camera).color
                 values.append(psnr(color.clamp(0, 1), view.composite(color.new_zeros(3))))
         return sum(values) / len(values)
 
     def checkpoint(self, key: str) -> Checkpoint:
-        """All of the state.
+        """A checkpoint with all of the state.
 
         Raises:
             NotFiniteError: any of it is not finite.
@@ -133,7 +133,7 @@ class Trainer:
         return Checkpoint(self.iteration, key, tensors, {**self.curve.state(), "untrained": self.untrained})
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Goes back to where ``checkpoint`` was taken."""
+        """Restores the state of a checkpoint."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
         self.avatar.apply_skin()
         self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
@@ -141,7 +141,7 @@ class Trainer:
         self._update_phase()
 
     def require_finite(self) -> None:
-        """Refuses to go on with a parameter that is not finite, however it came to be so.
+        """Refuses to go on with a parameter that is not finite.
 
         Raises:
             NotFiniteError: naming the parameter and the iteration.
@@ -154,7 +154,7 @@ class Trainer:
         require_finite(state, "training", f"after iteration {self.iteration}", self._remedy)
 
     def _require_finite_gradients(self) -> None:
-        """A loss that is finite may have a slope that is not, and Adam would spread it over all weights."""
+        """Refuses gradients that are not finite: a finite loss may have them, and Adam would spread them."""
         found = [(name, weight.grad) for name, weight in self._parameters if weight.grad is not None]
         if not finite(gradient for _, gradient in found):
             named = {f"the gradient of {name}": gradient for name, gradient in found}
@@ -162,7 +162,7 @@ class Trainer:
 
     @property
     def _where(self) -> str:
-        """Where in the run the present step is, for messages."""
+        """The present iteration and frames in words, for messages."""
         batch = self.settings.batch
         frames = [self.objective.draw(self.iteration * batch + place).frame for place in range(batch)]
         numbers = ", ".join(map(str, frames))
@@ -177,7 +177,8 @@ class Trainer:
 
     def _modules(self) -> dict[str, torch.nn.Module]:
         modules: dict[str, torch.nn.Module] = {
-            "avatar": self.avatar, "poses": self.poses, "sight": self.objective.sight,
+            "avatar": self.avatar, "poses": self.poses,
+            "visibility_cache": self.objective.visibility_cache,
         }  # fmt: skip
         return modules if self.gate is None else {**modules, "gate": self.gate}
 
@@ -221,7 +222,7 @@ def describe(values: dict[str, float]) -> str:
 
 
 def point_values(trainer: Trainer, psnr_db: float | None) -> dict[str, float]:
-    """What a point of the curve holds besides the loss terms."""
+    """The values of a point of the curve besides the loss terms."""
     values = {
         "gaussians": float(len(trainer.avatar.surface(trainer.level).canonical)),
         "learning_rate": trainer.settings.learning_rate

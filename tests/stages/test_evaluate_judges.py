@@ -148,8 +148,8 @@ class Faces:
     """Embeds a picture by its mean colour, and sees no face in dark ones."""
 
     def read(self, image, box=None):
-        left, top, right, bottom = (max(0, side) for side in box)
-        mean = image[top:bottom, left:right].reshape(-1, 3).mean(0)
+        inside = box.clipped(image.shape[1], image.shape[0])
+        mean = image[inside.slices].reshape(-1, 3).mean(0)
         return Face(box, mean / 255) if mean.sum() > 60 else None
 
 

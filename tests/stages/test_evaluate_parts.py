@@ -5,12 +5,12 @@ import pytest
 import roma
 import torch
 
+from pipeline.boxes import Box
 from pipeline.camera import project, to_camera
 from pipeline.splat import Gaussians
 from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.baselines import mean_frame, nearest_frames
-from stages.evaluate.evidence import evenly
-from stages.evaluate.pictures import compare, comparison_sheet, person_box
+from stages.evaluate.pictures import compare, comparison_sheet
 from stages.evaluate.rendering import turn_pictures
 from stages.evaluate.scoring import Score, table
 from tests.stages.evaluate_subject import stand_in
@@ -46,12 +46,6 @@ def test_means_leave_out_what_is_not_defined():
     assert table(scores, ["psnr", "psnr_interior", "ssim"]) == {
         "test": {"avatar": {"psnr": 25.0, "psnr_interior": 31.0, "ssim": None}}
     }
-
-
-def test_evenly_spaced():
-    assert evenly(range(10), 4) == [0, 3, 6, 9]
-    assert evenly(range(10), 1) == [5]
-    assert evenly(range(3), 5) == [0, 1, 2]
 
 
 def test_the_arms_hang_in_the_relaxed_pose():
@@ -116,14 +110,7 @@ def test_comparison_by_hand():
     image[5, 6] = 0.2
     one = compare(4, truth, image, 3.0, 31.0)
     assert one.error[5, 6].tolist() == [153, 153, 153] and one.error.sum() == 3 * 153
-    cropped = one.cropped((6, 5, 10, 9))
+    cropped = one.cropped(Box(6, 5, 10, 9))
     assert cropped.render.shape == (4, 4, 3) and cropped.render[0, 0, 0] == 51
     sheet = comparison_sheet([one, one], 3.0)
     assert sheet.shape[1] == 3 * 30 + 2 * 6 and sheet.dtype == np.uint8
-
-
-def test_the_persons_box():
-    mask = np.zeros((50, 60), np.uint8)
-    mask[20:30, 5:40] = 255
-    assert person_box([mask], margin=8) == (0, 12, 48, 38)
-    assert person_box([np.zeros((5, 7), np.uint8)]) == (0, 0, 7, 5)

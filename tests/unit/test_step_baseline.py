@@ -45,7 +45,7 @@ def test_a_body_without_enough_vertices_is_refused():
 def test_straightforward_gaussians_are_ours(pair):
     avatar, plain = pair
     pose = step.frames_of(avatar, 1, 16)[0].pose
-    ours, theirs = (model.pose(model.decode(), *pose.values()) for model in pair)
+    ours, theirs = (model.pose(model.decode(), pose) for model in pair)
     for mine, other in zip(ours.gaussians.tensors(), theirs.gaussians.tensors(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-5)
     assert ours.pose_offset.abs().max() > 0
@@ -101,7 +101,6 @@ def test_animation_has_a_row_a_contestant_and_a_headline(monkeypatch, capsys, tm
     timings = json.loads(path.read_text())["timings"]
     count = timings[0]["gaussians"]
     assert all(timing["asset_mib"] == 14 * 4 * count / 2**20 for timing in timings)  # as the paper counts it
-    assert [timing["file_mib"] > 0 for timing in timings] == [False, False, True]
 
 
 class Slow(torch.autograd.Function):
