@@ -17,11 +17,11 @@ from pipeline.boxes import Box, person_box
 from pipeline.curves import read_curve
 from pipeline.frames import write_png, write_video
 from pipeline.job import peak_memory, shown
+from pipeline.json_files import write_json
 from pipeline.metrics import Lpips
 from pipeline.metrics.identity import FaceReader
 from pipeline.pictures import resized, side_by_side
 from pipeline.plan import Plan, read_plan
-from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, render, write_ply
 from pipeline.spread import spread_end_to_end

@@ -17,11 +17,11 @@ from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
+from pipeline.numba_kernels import threads
 from pipeline.plan import read_plan
 from pipeline.settings import as_dict
 from pipeline.spread import spread_from_start
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.data import TrainingData, read_training_data

@@ -9,9 +9,10 @@ from pipeline.body import Poses, write_poses
 from pipeline.camera import facing_camera
 from pipeline.curves import Curve
 from pipeline.frames import write_frame, write_mask
+from pipeline.json_files import write_json
 from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
 from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_json, write_split
+from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import Gaussians, render
 from pipeline.stage import Context
 from pipeline.tables import write_table

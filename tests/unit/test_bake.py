@@ -13,8 +13,8 @@ from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import faces_of_vertices, joints_of_points, normals_of_vertices
 from pipeline.body import Pose, load_body, mean_identity, vertex_normals
 from pipeline.camera import facing_camera
+from pipeline.numba_kernels import threads
 from pipeline.splat import render
-from pipeline.threads import threads
 from pipeline.workspace import REPOSITORY
 from stages.evaluate.rendering import animator
 
