@@ -357,7 +357,7 @@ def headline(study: Tradeoff) -> str:
     levels, base = study.choices[single & study.choices["psnr"].notna()], study.points.loc[1]
     if levels.empty:
         return "The budget reached no setting but the study's own: give it more time."
-    noise = max(study.noise, 0.0)
+    noise = study.noise if math.isfinite(study.noise) else 0.0
     gaining = levels[levels["gain"] > noise]
     if gaining.empty:
         chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"
