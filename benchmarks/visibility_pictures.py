@@ -60,7 +60,7 @@ def ghost(subject: Any, trainer: Trainer, folder: Path | None) -> float:
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         image = rendering.color + (1 - rendering.alpha[..., None]) * 0.82
-        name = f"ghost_{subject.name}_{'off' if trainer.gate is None else 'on'}.png"
+        name = f"ghost_{subject.name}_{'on' if 'gate' in trainer.hooks else 'off'}.png"
         write_png(folder / name, (image.clamp(0, 1) * 255).byte().numpy())
     return float(rendering.alpha[~seen].sum())
 
@@ -119,7 +119,7 @@ def gradient_picture(
         trainer = trainer_of(subject, dataclasses.replace(settings, **changes))
         if name == "with":
             trainer.avatar.gate(gated.avatar.active)
-            trainer.gate = None
+            del trainer.hooks["gate"]
         total = torch.zeros(len(only))
         for _ in range(STEPS):
             trainer.step()

@@ -9,12 +9,12 @@ from torch import nn
 from pipeline.avatar import Avatar
 from pipeline.clip import ViewCache
 from pipeline.records import Split
-from stages.train import run as stage
 from stages.train.data import TrainingData
+from stages.train.initial_avatar import initial_avatar
 from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-from tests.stages.train_subject import context_for, write_subject
+from tests.stages.train_subject import context_for, data_for, write_subject
 
 ALL_ON = {"pose_noise": 0.0, "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0}
 
@@ -65,9 +65,9 @@ class Scene:
 
 def scene(subject, output, **changes) -> Scene:
     context = context_for(subject, output, **{**ALL_ON, **changes})
-    data = stage.read_training_data(context)
+    data = data_for(context)
     refinement = PoseRefinement(data.poses, data.clip.split.train)
-    avatar, data = stage.prepare(data, refinement, context.settings, context)
+    avatar, data = initial_avatar(data, refinement, context.settings)
     avatar.pose_heads_active = avatar.residuals_active = True
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():
