@@ -152,13 +152,14 @@ STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
 
 
 def describe_objective(settings: TrainSettings) -> str:
-    """The terms that take part with their weights and first iterations, in one line for the log."""
-    return "objective: " + ", ".join(
-        f"{term.name} {'/'.join(f'{getattr(settings, name):g}' for name in term.weights)}"
-        + (f" from iteration {term.first_iteration(settings)}" if term.first_iteration(settings) else "")
-        for term in (*FRAME_TERMS, *STATIC_TERMS)
-        if term.first_iteration(settings) is not None
-    )
+    """The terms that take part, each with its weights and first iteration: a line for the log."""
+    found = []
+    for term in (*FRAME_TERMS, *STATIC_TERMS):
+        first = term.first_iteration(settings)
+        if first is not None:
+            weights = "/".join(f"{getattr(settings, name):g}" for name in term.weights)
+            found.append(f"{term.name} {weights}" + (f" from iteration {first}" if first else ""))
+    return "objective: " + ", ".join(found)
 
 
 class Objective:
@@ -220,9 +221,10 @@ class Objective:
         total: Terms = {}
         for position in range(iteration * batch, (iteration + 1) * batch):
             frame = self._render(decoded, self.draw(position), level, poses_move)
-            for name, value in self._evaluate(FRAME_TERMS, frame, iteration).items():
+            terms = self._evaluate(FRAME_TERMS, frame, iteration, position, frame.view.generated)
+            for name, value in terms.items():
                 total[name] = total.get(name, torch.zeros_like(value)) + value / batch
-        static = StaticAvatar(decoded, self._regions(decoded.surface))
+        static = StaticAvatar(decoded=decoded, regions=self._regions(decoded.surface))
         return {**total, **self._evaluate(STATIC_TERMS, static, iteration)}
 
     def draw(self, position: int) -> Draw:
@@ -257,27 +259,23 @@ class Objective:
             crop_side=self.settings.lpips_crop,
         )
 
-    def _evaluate(self, terms: Sequence[Term[Source]], source: Source, iteration: int) -> Terms:
-        """The weighted scalars of the terms that take part."""
-        found = ((term.name, self._value(term, source, iteration)) for term in terms)
-        return {name: value for name, value in found if value is not None}
-
-    def _value(self, term: Term[Source], source: Source, iteration: int) -> Tensor | None:
-        """A term's weighted scalar; None where it takes no part."""
-        settings = self.settings
-        framed = isinstance(source, RenderedFrame)
-        position, generated = (source.draw.position, source.view.generated) if framed else (0, False)
-        if not term.takes_part(settings, iteration, position, generated):
-            return None
-        operands = term.of(source)
-        if any(operand is None for operand in operands):
-            return None
-        weight, mask = source.regions.weights.get(term.name), term.mask(source) if term.mask else None
-        if mask is not None:
-            weight = mask if weight is None else mask * weight
-        count = term.count(source) if term.count else None
-        mean = losses.weighted_mean(term.loss(*operands), weight, count)
-        return term.scalar_weight(settings, generated) * mean
+    def _evaluate(
+        self,
+        terms: Sequence[Term[Source]],
+        source: Source,
+        iteration: int,
+        position: int = 0,
+        generated: bool = False,
+    ) -> Terms:
+        """The weighted scalars of the terms that take part; the arguments are those of ``takes_part``."""
+        found: Terms = {}
+        for term in terms:
+            if not term.takes_part(self.settings, iteration, position, generated):
+                continue
+            mean = _reduced(term, source)
+            if mean is not None:
+                found[term.name] = term.scalar_weight(self.settings, generated) * mean
+        return found
 
     def _regions(self, surface: Surface) -> Regions:
         """The regions of a surface, computed once until another takes its place."""
@@ -290,3 +288,15 @@ class Objective:
             arms = bool(self.settings.arm_color)
             self._last_regions = surface, find_regions(surface.canonical, by_part, arms)
         return self._last_regions[1]
+
+
+def _reduced(term: Term[Source], source: Source) -> Tensor | None:
+    """The mean of a term's loss, weighted by its mask and by body part; None where an operand is missing."""
+    operands = term.of(source)
+    if any(operand is None for operand in operands):
+        return None
+    weight, mask = source.regions.weights.get(term.name), term.mask(source) if term.mask else None
+    if mask is not None:
+        weight = mask if weight is None else mask * weight
+    count = term.count(source) if term.count else None
+    return losses.weighted_mean(term.loss(*operands), weight, count)
