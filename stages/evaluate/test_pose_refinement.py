@@ -21,8 +21,8 @@ from pipeline.metrics.protocol import BACKGROUNDS, over
 from pipeline.plan import Plan
 from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
-from stages.evaluate.evidence import Evidence, Pose
-from stages.evaluate.rendering import Animate
+from stages.evaluate.evaluated_clip import EvaluatedClip, Pose
+from stages.evaluate.methods import Animate
 from stages.evaluate.settings import EvaluateSettings
 
 EFFECT = "test_time_refinement"  # the plan's name of it
@@ -33,8 +33,8 @@ DECAYS = (0.75, 0.95)  # shares of the steps after which a step is a tenth as lo
 
 
 @dataclasses.dataclass(frozen=True)
-class Refinement:
-    """What came of it.
+class RefinedTestPoses:
+    """The refined poses of the held-out frames.
 
     Attributes:
         poses: held-out frame -> its pose; the fit's where refinement stopped. Empty where none was asked for.
@@ -47,22 +47,22 @@ class Refinement:
     steps: int
 
 
-NONE = Refinement({}, (), 0)
+NOT_REFINED = RefinedTestPoses({}, (), 0)
 
 
-def called_for(settings: EvaluateSettings, plan: Plan) -> bool:
-    """Whether test poses are refined: as the protocol or a setting says, or the plan where they leave it."""
+def is_called_for(settings: EvaluateSettings, plan: Plan) -> bool:
+    """True where test poses are refined: as the protocol or a setting says, else as the plan does."""
     asked = settings.choices.refine_test_poses
     return plan.on(EFFECT) if asked == PLAN else asked == ON
 
 
 def refine(
-    evidence: Evidence, animate: Animate, background: str, steps: int, advance: Callable[[], object]
-) -> Refinement:
+    clip: EvaluatedClip, animate: Animate, background: str, steps: int, advance: Callable[[], object]
+) -> RefinedTestPoses:
     """Refines the pose of every held-out frame.
 
     Args:
-        evidence: the clip.
+        clip: the clip.
         animate: a pose -> Gaussians, with gradients that reach the pose alone.
         background: what both images are composited on.
         steps: a frame.
@@ -70,20 +70,20 @@ def refine(
     """
     poses: dict[int, Pose] = {}
     stopped = []
-    for frame in evidence.split.test:
-        fitted = evidence.pose(frame)
-        refined = refined_pose(frame_loss(evidence, animate, background, frame), fitted, steps)
+    for frame in clip.split.test:
+        fitted = clip.pose(frame)
+        refined = refined_pose(frame_loss(clip, animate, background, frame), fitted, steps)
         if refined is None:
             stopped.append(frame)
         poses[frame] = refined or fitted
         advance()
-    return Refinement(poses, tuple(stopped), steps)
+    return RefinedTestPoses(poses, tuple(stopped), steps)
 
 
-def frame_loss(evidence: Evidence, animate: Animate, background: str, frame: int) -> Callable[[Pose], Tensor]:
+def frame_loss(clip: EvaluatedClip, animate: Animate, background: str, frame: int) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
-    camera, seconds = evidence.cameras[frame], evidence.seconds(frame)
-    truth = evidence.person(frame, background)
+    camera, seconds = clip.cameras[frame], clip.seconds(frame)
+    truth = clip.person(frame, background)
 
     def loss(pose: Pose) -> Tensor:
         rendering = render(animate(*pose, seconds), camera)
@@ -135,15 +135,15 @@ def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Po
     return best
 
 
-def write_refined(path: Path, refinement: Refinement) -> None:
+def write_refined(path: Path, refined: RefinedTestPoses) -> None:
     """Writes ``test_poses.parquet``: the refined poses in the layout of ``poses.parquet``.
 
-    ``valid`` says whether a frame was refined.
+    ``valid`` is true where a frame was refined.
     """
-    frames = tuple(sorted(refinement.poses))
-    poses = [refinement.poses[frame] for frame in frames]
+    frames = tuple(sorted(refined.poses))
+    poses = [refined.poses[frame] for frame in frames]
     rotation, expression, transl = (torch.stack(part) for part in zip(*poses, strict=True))
-    valid = torch.tensor([frame not in refinement.stopped for frame in frames])
+    valid = torch.tensor([frame not in refined.stopped for frame in frames])
     write_poses(path, Poses(frames, rotation, expression, transl, valid))
 
 

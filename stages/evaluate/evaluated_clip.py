@@ -1,11 +1,11 @@
-"""What the avatar is judged against: the clip as ingest published it, and the poses."""
+"""The clip that an avatar is compared with: as ingest published it, in the fit's poses and training's."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,7 +31,7 @@ Pose = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclasses.dataclass(frozen=True)
-class Evidence:
+class EvaluatedClip:
     """A clip with its split, cameras and poses.
 
     Attributes:
@@ -40,7 +40,7 @@ class Evidence:
         split: the frames that were trained on and those held out.
         cameras: a camera a frame.
         fitted: the fit's poses, of every kept frame.
-        refined: the training frames' poses as training left them.
+        trained: the training frames' poses as training left them.
         keypoints: what was detected in the frames.
     """
 
@@ -49,20 +49,13 @@ class Evidence:
     split: Split
     cameras: Mapping[int, Camera]
     fitted: Poses
-    refined: Poses
+    trained: Poses
     keypoints: Keypoints
 
-    def points(self, index: int) -> np.ndarray | None:
-        """The frame's 133 whole-body points with scores, [133, 3]; None where nobody looked at it."""
-        try:
-            return self.keypoints.whole_body[self.keypoints.index(index)]
-        except KeyError:
-            return None
-
-    def follow(self, first: int, second: int) -> bool:
-        """Whether the second frame is the next that was kept after the first."""
-        rows = _rows(tuple(sorted(self.cameras)))
-        return first in rows and rows.get(second) == rows[first] + 1
+    @cached_property
+    def places(self) -> Mapping[int, int]:
+        """Frame -> its place among the kept frames."""
+        return {frame: place for place, frame in enumerate(sorted(self.cameras))}
 
     @cached_property
     def other_cameras(self) -> frozenset[int]:
@@ -95,31 +88,41 @@ class Evidence:
         """The person on a background, [H, W, 3] float32 in [0, 1]."""
         return composite(self.frame(index), self.mask(index), background)
 
+    def points(self, index: int) -> np.ndarray | None:
+        """The frame's 133 whole-body points with scores, [133, 3]; None where none were looked for."""
+        try:
+            return self.keypoints.whole_body[self.keypoints.index(index)]
+        except KeyError:
+            return None
+
+    def follows(self, first: int, second: int) -> bool:
+        """True where the second frame is the next that was kept after the first."""
+        return first in self.places and self.places.get(second) == self.places[first] + 1
+
     def seconds(self, index: int) -> float | None:
-        """When the frame was filmed, from the clip's start; None where the source has no clock."""
-        row = _rows(tuple(sorted(self.cameras))).get(index)
-        known = row is not None and row < len(self.footage.seconds)
-        return self.footage.seconds[row] if known and row is not None else None
+        """The time at which a frame was filmed, from the clip's start; None where the source has no clock."""
+        place = self.places.get(index)
+        return None if place is None or place >= len(self.footage.seconds) else self.footage.seconds[place]
 
     def pose(self, index: int) -> Pose:
-        """The pose that a frame is rendered in: rotation [55, 3], expression [E], transl [3].
+        """The pose that a frame is rendered in.
 
         A training frame has the pose that training refined. A held-out frame has the fit's, which
-        knows its keypoints and nothing else of the image. (What refining it on the held-out image
-        itself makes of it is in ``refinement.py``; its numbers stand beside these.)
+        knows its keypoints and nothing else of the image. (Poses refined on the held-out images
+        themselves are in ``test_pose_refinement.py``; their numbers stand beside these.)
 
         Raises:
             UserError: neither the fit nor training has a pose for the frame.
         """
-        held_out = index in self.split.test
-        for poses in (self.fitted,) if held_out else (self.refined, self.fitted):
-            row = _row_of(poses, index)
-            if row is not None:
+        known = (self.fitted,) if index in self.split.test else (self.trained, self.fitted)
+        for poses in known:
+            if index in poses.frames:
+                row = poses.index(index)
                 return poses.rotation[row], poses.expression[row], poses.transl[row]
         raise UserError(f"frame {index} has no pose in the fit's poses.parquet: run the fit stage again")
 
 
-def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
+def read_clip(inputs: Mapping[str, Path]) -> EvaluatedClip:
     """Reads what the upstream stages published.
 
     Args:
@@ -129,13 +132,13 @@ def read_evidence(inputs: Mapping[str, Path]) -> Evidence:
         UserError: a file is missing or damaged.
     """
     ingest = inputs["ingest"]
-    return Evidence(
+    return EvaluatedClip(
         folder=ingest,
         footage=read_footage(ingest / "footage.json"),
         split=read_split(ingest / "split.json"),
         cameras=read_cameras(ingest / "cameras.parquet"),
         fitted=read_poses(inputs["fit"] / "poses.parquet"),
-        refined=read_poses(inputs["train"] / "poses.parquet"),
+        trained=read_poses(inputs["train"] / "poses.parquet"),
         keypoints=read_keypoints(ingest / "keypoints.parquet"),
     )
 
@@ -147,12 +150,3 @@ def evenly(items: Sequence[Item], count: int) -> list[Item]:
     if count == 1:
         return [items[len(items) // 2]]
     return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]
-
-
-@lru_cache(maxsize=4)
-def _rows(frames: tuple[int, ...]) -> Mapping[int, int]:
-    return {frame: row for row, frame in enumerate(frames)}
-
-
-def _row_of(poses: Poses, index: int) -> int | None:
-    return _rows(poses.frames).get(index)

@@ -1,4 +1,4 @@
-"""The textured mesh: the fitted body in the clip's colours, what any avatar adds its Gaussians to.
+"""The textured mesh: the fitted body in the clip's colours, to which an avatar adds its Gaussians.
 
 It has the same poses as the avatar and so the same errors of the fit. What the avatar has over it are hair,
 clothes, and colours that follow the pose.
@@ -6,7 +6,9 @@ clothes, and colours that follow the pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,34 +19,47 @@ from pipeline.body import BodyModel, Identity, pose_body
 from pipeline.camera import Camera
 from pipeline.metrics.protocol import composite
 from pipeline.texture import FineSurface, View, fine_surface, gather, paint
-from stages.evaluate.evidence import Evidence, Pose
+from stages.evaluate.evaluated_clip import EvaluatedClip, Pose
+from stages.evaluate.methods import MESH, OnBackground
 
 LEVELS = 1  # of subdivision: vertices 4 to 8 mm apart
 
 
+@dataclasses.dataclass(frozen=True)
 class TexturedMesh:
-    """The fitted body, a colour a vertex.
+    """The fitted body, a colour a vertex, in the avatar's poses.
 
     Attributes:
+        clip: gives poses and cameras.
+        body, identity: as they were fitted.
+        surface: the subdivided body.
         colors: [N, 3] float32, 0 to 255, of the subdivided body.
         known: the share of its vertices that the frames show; the others have the nearest known colour.
+        name: ``MESH``.
     """
 
-    def __init__(
-        self, body: BodyModel, identity: Identity, surface: FineSurface, colors: np.ndarray, known: float
-    ):
-        self._body, self._identity, self._surface = body, identity, surface
-        self.colors, self.known = colors, known
+    clip: EvaluatedClip
+    body: BodyModel
+    identity: Identity
+    surface: FineSurface
+    colors: np.ndarray  # [N, 3]
+    known: float
+    name: str = MESH
 
-    def on(self, pose: Pose, camera: Camera) -> Callable[[str], Tensor]:
-        """A background -> the mesh in a pose on it, [H, W, 3] float in [0, 1]."""
-        vertices = posed(self._body, self._identity, pose)
-        image, mask, _ = paint(camera, self._surface, vertices, self.colors)
-        return lambda background: composite(image, mask, background)
+    @property
+    def frames(self) -> Collection[int]:
+        """The held-out frames."""
+        return self.clip.split.test
+
+    def render(self, frame: int, camera: Camera | None = None) -> OnBackground:
+        """The mesh in a frame's pose, seen by the frame's camera or by another."""
+        vertices = posed(self.body, self.identity, self.clip.pose(frame))
+        image, mask, _ = paint(camera or self.clip.cameras[frame], self.surface, vertices, self.colors)
+        return partial(composite, image, mask)
 
 
 def textured_mesh(
-    evidence: Evidence,
+    clip: EvaluatedClip,
     body: BodyModel,
     identity: Identity,
     frames: Sequence[int],
@@ -53,7 +68,7 @@ def textured_mesh(
     """Gathers the colours that some training frames show of the fitted body.
 
     Args:
-        evidence: the clip.
+        clip: the clip.
         body, identity: as they were fitted.
         frames: which to look at.
         advance: called after each frame.
@@ -62,15 +77,14 @@ def textured_mesh(
 
     def views() -> Iterator[View]:
         for frame in frames:
-            vertices = posed(body, identity, evidence.pose(frame))
-            yield View(evidence.cameras[frame], vertices, evidence.frame(frame), evidence.mask(frame))
+            vertices = posed(body, identity, clip.pose(frame))
+            yield View(clip.cameras[frame], vertices, clip.frame(frame), clip.mask(frame))
             advance()
 
     seen = gather(surface, views(), len(frames))
     template = surface.refine(body.v_template).numpy()
-    return TexturedMesh(
-        body, identity, surface, nearest_known(seen.color, seen.known, template), seen.known.mean()
-    )
+    colors = nearest_known(seen.color, seen.known, template)
+    return TexturedMesh(clip, body, identity, surface, colors, float(seen.known.mean()))
 
 
 def nearest_known(color: np.ndarray, known: np.ndarray, places: np.ndarray) -> np.ndarray:
