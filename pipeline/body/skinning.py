@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pipeline.body.body_model import BodyModel
 from pipeline.body.identity import Identity, expression_offsets, rest_joints, rest_vertices
+from pipeline.body.poses import Pose
 
 
 def joint_transforms(
@@ -126,6 +127,23 @@ def pose_body(
     transforms, posed = matrix_transforms(roma.rotvec_to_rotmat(rotation), joints, body.parents)
     vertices = skin(transforms, body.skinning_weights, rest)
     return vertices + transl[..., None, :], posed + transl[..., None, :]
+
+
+def pose_frame(body: BodyModel, identity: Identity, pose: Pose) -> tuple[Tensor, Tensor]:
+    """The whole mesh and its joints in one frame.
+
+    Returns:
+        vertices [V, 3] and joints [55, 3], metres, in the world.
+    """
+    vertices, joints = pose_body(
+        body, identity, pose.rotation[None], pose.expression[None], pose.transl[None]
+    )
+    return vertices[0], joints[0]
+
+
+def posed_vertices(body: BodyModel, identity: Identity, pose: Pose) -> Tensor:
+    """The mesh in one frame: [V, 3], metres, in the world."""
+    return pose_frame(body, identity, pose)[0]
 
 
 def _forward_kinematics(local: Tensor, joints: Tensor, parents: tuple[int, ...]) -> tuple[Tensor, Tensor]:

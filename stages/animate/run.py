@@ -91,8 +91,7 @@ def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
 
 def posed(script: Script, actor: Actor, frame: int) -> Gaussians:
     """The Gaussians of a frame."""
-    placed = script.placed
-    return actor.gaussians(placed.rotation[frame], placed.expression[frame], placed.transl[frame])
+    return actor.gaussians(script.placed.pose(frame))
 
 
 def shots(context: Context, script: Script, actor: Actor, body: BodyModel) -> list[Camera]:

@@ -12,9 +12,8 @@ from torch import Tensor
 from pipeline.body import rasterize
 from pipeline.body.mesh import Raster
 from pipeline.camera import Camera, project, to_camera
-from pipeline.records import spread
+from pipeline.clip import FittedClip
 from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import Clip
 
 SHOWN = 0.5  # share of the training frames that must have a vertex within their borders
 LOOKED_AT = 24  # training frames that are asked
@@ -56,12 +55,12 @@ class Cropped:
     news: float
 
 
-def find_framing(clip: Clip) -> Framing:
+def find_framing(clip: FittedClip) -> Framing:
     """Look at some training frames of the clip."""
-    frames = spread(clip.train, LOOKED_AT)
+    frames = clip.spread(LOOKED_AT)
     shown, densities = torch.zeros(len(clip.body.v_template)), []
     for frame in frames:
-        camera, vertices = clip.cameras[frame], clip.vertices(frame)
+        camera, vertices = clip.camera(frame), clip.vertices(frame)
         pixels, depth = project(camera, vertices), to_camera(camera, vertices)[:, 2]
         inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
         inside &= depth > 0

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,12 +22,13 @@ import torch
 
 from pipeline.body import Poses, read_poses, rest_joints
 from pipeline.camera import Camera, facing_camera
+from pipeline.clip import FittedClip
 from pipeline.errors import UserError
 from pipeline.keypoints import COUNT
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
 from pipeline.records import read_cameras, read_json
 from stages.auxiliary.offer import Offer, Picture
-from stages.auxiliary.turn import ID_OFFSET, Clip, Turn
+from stages.auxiliary.turn import ID_OFFSET, Turn
 
 PICTURES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d+)")
@@ -34,7 +36,7 @@ _REMEDY = "see docs/auxiliary.md for the layouts that auxiliary.folder may have"
 _LARGEST = 1e6
 
 
-def read_folder(path: Path, clip: Clip, turn: Turn, body_file: Path) -> Offer:
+def read_folder(path: Path, clip: FittedClip, turn: Turn, body_file: Path) -> Offer:
     """What lies at ``path``, whichever layout it has.
 
     Raises:
@@ -66,7 +68,8 @@ def numbered(folder: Path) -> dict[int, Path]:
 
 
 def _ours(path: Path, frames: Path) -> Offer:
-    files, poses = numbered(frames), read_poses(path / "poses.parquet")
+    # Whatever their poses came from, the pictures were made from them.
+    files, poses = numbered(frames), dataclasses.replace(read_poses(path / "poses.parquet"), valid=None)
     cameras = read_cameras(path / "cameras.parquet")
     masks = numbered(path / "masks") if (path / "masks").is_dir() else {}
     usable = [frame for frame in poses.frames if frame in files and frame in cameras]
@@ -81,7 +84,7 @@ def _ours(path: Path, frames: Path) -> Offer:
     return Offer(poses, cameras, pictures())
 
 
-def _peers(path: Path, frames: Path, clip: Clip, body_file: Path) -> Offer:
+def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Offer:
     """The peers' ``_gen`` folder; frames are those with a picture, a pose and a camera, and on the list."""
     files = numbered(frames)
     files = {frame % ID_OFFSET: file for frame, file in files.items()}

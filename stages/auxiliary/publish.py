@@ -9,15 +9,16 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import write_poses
+from pipeline.body import posed_vertices, write_poses
 from pipeline.camera import Camera
+from pipeline.clip import FittedClip
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.records import write_cameras, write_json
-from stages.auxiliary.accept import Accepted, posed, rows_of
+from stages.auxiliary.accept import Accepted
 from stages.auxiliary.crop import Framing, crop
 from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import ID_OFFSET, Clip
+from stages.auxiliary.turn import ID_OFFSET
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -30,7 +31,7 @@ _SHEET, _TILE = 8, 256  # frames of the contact sheet, and pixels of their heigh
 
 def publish(
     context: Context,
-    clip: Clip,
+    clip: FittedClip,
     accepted: Accepted,
     framing: Framing,
     surface: FineSurface,
@@ -56,10 +57,10 @@ def publish(
     cameras: dict[int, Camera] = {}
     refused, sheet = dict(accepted.refused), []
     with context.progress(len(accepted.poses), "crops") as progress:
-        for row, frame in enumerate(accepted.poses.frames):
+        for frame in accepted.poses.frames:
             image = read_frame(accepted.folder / "frames", frame)
             mask = read_mask(accepted.folder / "masks", frame)
-            vertices = posed(clip, accepted.poses, row)[0]
+            vertices = posed_vertices(clip.body, clip.identity, accepted.poses.pose(frame))
             made = crop(image, mask, accepted.cameras[frame], vertices, surface, carried, framing)
             reason = OUT_OF_FRAME if made is None else NOTHING_NEW if made.news < LEAST_NEWS else None
             if reason == NOTHING_NEW and not settings.unseen_only:
@@ -86,12 +87,12 @@ def write_records(
     """Write cameras, poses, keypoints and ``auxiliary.json`` of the frames that have a camera."""
     output, frames = context.output, sorted(cameras)
     numbers = tuple(ID_OFFSET + frame for frame in frames)
-    poses = dataclasses.replace(rows_of(accepted.poses, frames), frames=numbers)
+    poses = dataclasses.replace(accepted.poses.select(frames), frames=numbers)
     write_poses(output / "poses.parquet", poses)
     write_cameras(output / "cameras.parquet", {ID_OFFSET + frame: cameras[frame] for frame in frames})
     table = empty_keypoints(np.array(numbers, np.int64))
     for row, frame in enumerate(frames):
-        points = accepted.keypoints[accepted.poses.frames.index(frame)]
+        points = accepted.keypoints[accepted.poses.index(frame)]
         table.whole_body[row] = moved(points, accepted.cameras[frame], cameras[frame])
     write_keypoints(output / "keypoints.parquet", table)
     distances = [value for frame in frames if (value := accepted.identity.get(frame)) is not None]

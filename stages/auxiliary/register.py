@@ -25,7 +25,7 @@ from pipeline.body import (
 )
 from pipeline.body.joints import BODY_POSE
 from pipeline.camera import Camera, project
-from stages.auxiliary.turn import Clip
+from pipeline.clip import FittedClip
 
 POINTS = slice(0, 23)  # body and feet
 STEPS, RATE = 120, 0.01
@@ -38,7 +38,7 @@ MIRRORED = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15, 2
 
 
 def register(
-    clip: Clip,
+    clip: FittedClip,
     landmarks: Landmarks,
     poses: Poses,
     cameras: list[Camera],

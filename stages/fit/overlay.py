@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import BodyModel, Identity, Poses, draw_mesh, pose_body
+from pipeline.body import BodyModel, Identity, Poses, draw_mesh, posed_vertices
 from pipeline.camera import Camera
 from pipeline.frames import read_frame, read_mask
 
@@ -34,12 +34,10 @@ def overlays(
         frames: the folder of the clip's pictures.
         opacity: of the mesh, 0 to 1.
     """
-    for row, frame in enumerate(poses.frames):
+    for frame in poses.frames:
         with torch.no_grad():
-            one = slice(row, row + 1)
-            pose = poses.rotation[one], poses.expression[one], poses.transl[one]
-            vertices, _ = pose_body(body, identity, *pose)
-        yield draw_mesh(read_frame(frames, frame), cameras[frame], vertices[0], body.faces, opacity=opacity)
+            vertices = posed_vertices(body, identity, poses.pose(frame))
+        yield draw_mesh(read_frame(frames, frame), cameras[frame], vertices, body.faces, opacity=opacity)
 
 
 def sheet_rows(count: int, wanted: int = 6) -> list[int]:
