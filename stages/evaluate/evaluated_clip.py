@@ -1,4 +1,4 @@
-"""The clip that an avatar is compared with: as ingest published it, in the fit's poses and training's."""
+"""The clip that an avatar is compared with: fitted, with training frames in the poses that training left."""
 
 from __future__ import annotations
 
@@ -13,49 +13,50 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.body.poses import Poses, read_poses
-from pipeline.camera import Camera
-from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import Keypoints, read_keypoints
+from pipeline.body import BodyModel, Pose, Poses, read_poses
+from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.metrics.protocol import BLACK, composite
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
 
 Item = TypeVar("Item")
 
 OTHER_CAMERA_ANGLE = 5.0
 """Degrees about the person between a camera and every training camera, from which it is another one."""
 
-Pose = tuple[Tensor, Tensor, Tensor]
-"""Rotation [55, 3], expression [E] and transl [3] of a frame."""
-
 
 @dataclasses.dataclass(frozen=True)
-class EvaluatedClip:
-    """A clip with its split, cameras and poses.
+class EvaluatedClip(FittedClip):
+    """A fitted clip with the training frames' poses as training left them.
 
     Attributes:
-        folder: what ingest published.
-        footage: what the source was and what was kept of it.
-        split: the frames that were trained on and those held out.
-        cameras: a camera a frame.
-        fitted: the fit's poses, of every kept frame.
-        trained: the training frames' poses as training left them.
-        keypoints: what was detected in the frames.
+        trained: poses of training frames.
     """
 
-    folder: Path
-    footage: Footage
-    split: Split
-    cameras: Mapping[int, Camera]
-    fitted: Poses
     trained: Poses
-    keypoints: Keypoints
 
-    @cached_property
-    def places(self) -> Mapping[int, int]:
-        """Frame -> its place among the kept frames."""
-        return {frame: place for place, frame in enumerate(sorted(self.cameras))}
+    def pose(self, frame: int) -> Pose:
+        """The pose that a frame is rendered in.
+
+        A training frame has the pose that training refined. A held-out frame has the fit's, which
+        knows its keypoints and nothing else of the image. (Poses refined on the held-out images
+        themselves are in ``test_pose_refinement.py``; their numbers stand beside these.)
+        """
+        refined = frame not in self.split.test and frame in self.trained.frames
+        return (self.trained if refined else self.poses).pose(frame)
+
+    def person(self, frame: int, background: str = BLACK) -> Tensor:
+        """The person on a background, [H, W, 3] float32 in [0, 1]."""
+        return composite(self.frame(frame), self.mask(frame), background)
+
+    def points(self, frame: int) -> np.ndarray | None:
+        """The frame's 133 whole-body points with scores, [133, 3]; None where none were looked for."""
+        try:
+            return self.keypoints.whole_body[self.keypoints.index(frame)]
+        except KeyError:
+            return None
+
+    def follows(self, first: int, second: int) -> bool:
+        """True where the second frame is the next that was kept after the first."""
+        return first in self._places and self._places.get(second) == self._places[first] + 1
 
     @cached_property
     def other_cameras(self) -> frozenset[int]:
@@ -64,7 +65,7 @@ class EvaluatedClip:
         A camera that walks around passes between the places that it was seen from; only a view that is
         ``OTHER_CAMERA_ANGLE`` or more off, as seen from the person, is another one.
         """
-        person = self.fitted.transl.mean(0)
+        person = self.poses.transl.mean(0)
 
         def directions(frames: Sequence[int]) -> Tensor:
             centres = torch.stack([self.cameras[frame].centre for frame in frames]) - person
@@ -76,71 +77,25 @@ class EvaluatedClip:
         far = cosines < math.cos(math.radians(OTHER_CAMERA_ANGLE))
         return frozenset(frame for frame, other in zip(self.split.test, far.tolist(), strict=True) if other)
 
-    def frame(self, index: int) -> np.ndarray:
-        """The frame as filmed, [H, W, 3] uint8 RGB."""
-        return read_frame(self.folder / "frames", index)
-
-    def mask(self, index: int) -> np.ndarray:
-        """The person's soft alpha, [H, W] uint8."""
-        return read_mask(self.folder / "masks", index)
-
-    def person(self, index: int, background: str = BLACK) -> Tensor:
-        """The person on a background, [H, W, 3] float32 in [0, 1]."""
-        return composite(self.frame(index), self.mask(index), background)
-
-    def points(self, index: int) -> np.ndarray | None:
-        """The frame's 133 whole-body points with scores, [133, 3]; None where none were looked for."""
-        try:
-            return self.keypoints.whole_body[self.keypoints.index(index)]
-        except KeyError:
-            return None
-
-    def follows(self, first: int, second: int) -> bool:
-        """True where the second frame is the next that was kept after the first."""
-        return first in self.places and self.places.get(second) == self.places[first] + 1
-
-    def seconds(self, index: int) -> float | None:
-        """The time at which a frame was filmed, from the clip's start; None where the source has no clock."""
-        place = self.places.get(index)
-        return None if place is None or place >= len(self.footage.seconds) else self.footage.seconds[place]
-
-    def pose(self, index: int) -> Pose:
-        """The pose that a frame is rendered in.
-
-        A training frame has the pose that training refined. A held-out frame has the fit's, which
-        knows its keypoints and nothing else of the image. (Poses refined on the held-out images
-        themselves are in ``test_pose_refinement.py``; their numbers stand beside these.)
-
-        Raises:
-            UserError: neither the fit nor training has a pose for the frame.
-        """
-        known = (self.fitted,) if index in self.split.test else (self.trained, self.fitted)
-        for poses in known:
-            if index in poses.frames:
-                row = poses.index(index)
-                return poses.rotation[row], poses.expression[row], poses.transl[row]
-        raise UserError(f"frame {index} has no pose in the fit's poses.parquet: run the fit stage again")
+    @cached_property
+    def _places(self) -> Mapping[int, int]:
+        """Frame -> its place among the kept frames."""
+        return {frame: place for place, frame in enumerate(sorted(self.cameras))}
 
 
-def read_clip(inputs: Mapping[str, Path]) -> EvaluatedClip:
+def read_evaluated_clip(inputs: Mapping[str, Path], body: BodyModel | Path) -> EvaluatedClip:
     """Reads what the upstream stages published.
 
     Args:
         inputs: the folders of ingest, fit and train.
+        body: the body model that the clip was fitted with, or its file.
 
     Raises:
         UserError: a file is missing or damaged.
     """
-    ingest = inputs["ingest"]
-    return EvaluatedClip(
-        folder=ingest,
-        footage=read_footage(ingest / "footage.json"),
-        split=read_split(ingest / "split.json"),
-        cameras=read_cameras(ingest / "cameras.parquet"),
-        fitted=read_poses(inputs["fit"] / "poses.parquet"),
-        trained=read_poses(inputs["train"] / "poses.parquet"),
-        keypoints=read_keypoints(ingest / "keypoints.parquet"),
-    )
+    fitted = read_fitted_clip(inputs["ingest"], inputs["fit"], body)
+    parts = {field.name: getattr(fitted, field.name) for field in dataclasses.fields(fitted)}
+    return EvaluatedClip(**parts, trained=read_poses(inputs["train"] / "poses.parquet"))
 
 
 def evenly(items: Sequence[Item], count: int) -> list[Item]:

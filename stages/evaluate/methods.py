@@ -16,10 +16,11 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.bake import bake
+from pipeline.body import Pose
 from pipeline.camera import Camera
 from pipeline.metrics.protocol import BLACK, over
 from pipeline.splat import Gaussians, Rendering, render
-from stages.evaluate.evaluated_clip import EvaluatedClip, Pose
+from stages.evaluate.evaluated_clip import EvaluatedClip
 
 AVATAR, REFINED, MEAN, NEAREST, MESH, CEILING = METHODS = (
     "avatar", "avatar_refined", "mean_frame", "nearest_frame", "textured_mesh", "second_mask",
@@ -32,8 +33,8 @@ BASELINES = (MEAN, NEAREST, MESH)
 OnBackground = Callable[[str], Tensor]
 """A picture before it is composited: background -> [H, W, 3] float32 in [0, 1]."""
 
-Animate = Callable[[Tensor, Tensor, Tensor, float | None], Gaussians]
-"""rotation [55, 3], expression [E], transl [3], seconds -> Gaussians in world coordinates."""
+Animate = Callable[[Pose, float | None], Gaussians]
+"""A pose, and seconds from the clip's start or None -> Gaussians in world coordinates."""
 
 
 class Method(Protocol):
@@ -85,8 +86,8 @@ class AvatarMethod:
     def rendering(self, frame: int, camera: Camera | None = None) -> Rendering:
         """The same with its alpha."""
         pose = self.poses[frame] if frame in self.poses else self.clip.pose(frame)
-        gaussians = self.animate(*pose, self.clip.seconds(frame))
-        return render(gaussians, camera or self.clip.cameras[frame])
+        gaussians = self.animate(pose, self.clip.seconds.get(frame))
+        return render(gaussians, camera or self.clip.camera(frame))
 
 
 def baked_animation(avatar: Avatar) -> Animate:

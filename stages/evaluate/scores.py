@@ -128,7 +128,7 @@ def score_clip(
 
 def frame_truth(clip: EvaluatedClip, scorer: Scorer, split: str, frame: int) -> FrameTruth:
     """The person in a frame, with the crops of face and hands that were detected there."""
-    camera, points = clip.cameras[frame], clip.points(frame)
+    camera, points = clip.camera(frame), clip.points(frame)
     view = OTHER_CAMERA if split == HELD_OUT and frame in clip.other_cameras else ""
     boxes = {} if points is None else region_boxes(points, camera.width, camera.height)
     on = partial(clip.person, frame)

@@ -3,7 +3,7 @@
 The protocol of the NeuMan benchmark: the networks are frozen, and of each held-out frame rotation,
 expression and translation move, driven by that image alone. It tells the avatar's own error from the
 fit's, and it has looked at the answer: its numbers stand beside those at the fit's poses and never replace
-them.
+them. The method that shows the refined poses is an ``AvatarMethod`` of the name ``REFINED``.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipeline.body import Poses, write_poses
+from pipeline.body import Pose, Poses, write_poses
 from pipeline.metrics.image import dissimilarity
 from pipeline.metrics.protocol import BACKGROUNDS, over
 from pipeline.plan import Plan
 from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
-from stages.evaluate.evaluated_clip import EvaluatedClip, Pose
+from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import Animate
 from stages.evaluate.settings import EvaluateSettings
 
@@ -82,11 +82,11 @@ def refine(
 
 def frame_loss(clip: EvaluatedClip, animate: Animate, background: str, frame: int) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
-    camera, seconds = clip.cameras[frame], clip.seconds(frame)
+    camera, seconds = clip.camera(frame), clip.seconds.get(frame)
     truth = clip.person(frame, background)
 
     def loss(pose: Pose) -> Tensor:
-        rendering = render(animate(*pose, seconds), camera)
+        rendering = render(animate(pose, seconds), camera)
         image = over(rendering.color, rendering.alpha, background)
         return image_loss(image, truth.to(image), BACKGROUNDS[background])
 
@@ -110,16 +110,17 @@ def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Po
         The pose; None where the loss or its gradient was not finite.
     """
     pose = _copy(fitted)
-    for part in pose:
+    parts = _parts(pose)
+    for part in parts:
         part.requires_grad_()
-    optimiser = torch.optim.Adam(pose, LEARNING_RATE)
+    optimiser = torch.optim.Adam(parts, LEARNING_RATE)
     decays = [max(1, int(share * steps)) for share in DECAYS]
     schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, decays, 0.1)
     least, best = float("inf"), fitted
     for step in range(steps + 1):
         value = loss(pose)
         # A renderer leaves out what is not finite, so that the loss may not show it.
-        if not _finite(value, *pose):
+        if not _finite(value, *parts):
             return None
         if value.item() < least:
             least, best = value.item(), _copy(pose)
@@ -128,7 +129,7 @@ def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Po
         optimiser.zero_grad()
         value.backward()
         # What the image has no say in, such as an expression that the avatar lacks, has no gradient.
-        if not _finite(*(part.grad for part in pose if part.grad is not None)):
+        if not _finite(*(part.grad for part in parts if part.grad is not None)):
             return None
         optimiser.step()
         schedule.step()
@@ -141,15 +142,17 @@ def write_refined(path: Path, refined: RefinedTestPoses) -> None:
     ``valid`` is true where a frame was refined.
     """
     frames = tuple(sorted(refined.poses))
-    poses = [refined.poses[frame] for frame in frames]
-    rotation, expression, transl = (torch.stack(part) for part in zip(*poses, strict=True))
+    poses = Poses.stack(frames, [refined.poses[frame] for frame in frames])
     valid = torch.tensor([frame not in refined.stopped for frame in frames])
-    write_poses(path, Poses(frames, rotation, expression, transl, valid))
+    write_poses(path, dataclasses.replace(poses, valid=valid))
+
+
+def _parts(pose: Pose) -> tuple[Tensor, ...]:
+    return pose.rotation, pose.expression, pose.transl
 
 
 def _copy(pose: Pose) -> Pose:
-    rotation, expression, transl = (part.detach().clone() for part in pose)
-    return rotation, expression, transl
+    return Pose(*(part.detach().clone() for part in _parts(pose)))
 
 
 def _finite(*tensors: Tensor) -> bool:

@@ -7,12 +7,21 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from pipeline.metrics.regions import Box
-from stages.evaluate.rendering import to_bytes
+from pipeline.splat import Gaussians, Rendering, render
+from pipeline.turntable import orbit, visible_extent
+from stages.evaluate.evaluated_clip import EvaluatedClip, evenly
+from stages.evaluate.frame_metrics import to_bytes
+from stages.evaluate.methods import AvatarMethod
+from stages.evaluate.scores import ScoredFrame
+from stages.evaluate.settings import EvaluateSettings
 
 CLOSEUP = 160  # pixels
+COVER_HEIGHT = 400  # pixels
+GREY = 0.82
 _GAP = 6  # pixels between pictures
 _BAND = 26  # pixels of the caption above a column
 _PAPER = 255
@@ -42,7 +51,7 @@ class Comparison:
         """Truth, render, error: the order in which they are shown."""
         return self.truth, self.render, self.error
 
-    def cropped(self, box: tuple[int, int, int, int]) -> Comparison:
+    def cropped(self, box: Box) -> Comparison:
         """The same comparison inside (left, top, right, bottom)."""
         left, top, right, bottom = box
         cut = (slice(top, bottom), slice(left, right))
@@ -61,6 +70,55 @@ class Closeup:
 
     region: str
     comparison: Comparison
+
+
+@dataclasses.dataclass
+class Comparisons:
+    """The pictures that are kept of the frames while they are scored.
+
+    Attributes:
+        frames: those of ``comparison.png``; held out, or trained on where none is.
+        slider_frames: those of the report's slider; ``frames`` among them.
+        box: left, top, right, bottom of the person in all of these.
+        error_gain: the factor of the error pictures.
+        whole: frame -> its comparison, cropped to the box.
+        closeups: faces and hands of ``frames``.
+    """
+
+    frames: Sequence[int]
+    slider_frames: Sequence[int]
+    box: Box
+    error_gain: float
+    whole: dict[int, Comparison] = dataclasses.field(default_factory=dict)
+    closeups: list[Closeup] = dataclasses.field(default_factory=list)
+
+    def add(self, scored: ScoredFrame) -> None:
+        """Keeps the pictures of a frame, where it is to be shown."""
+        truth = scored.truth
+        if truth.frame not in self.slider_frames:
+            return
+        pair = compare(truth.frame, truth.picture.image, scored.render, self.error_gain, scored.psnr)
+        self.closeups += closeups(pair, truth.boxes) if truth.frame in self.frames else []
+        self.whole[truth.frame] = pair.cropped(self.box)
+
+    @property
+    def sheet(self) -> list[Comparison]:
+        """The comparisons of ``comparison.png``."""
+        return [self.whole[frame] for frame in self.frames]
+
+    @property
+    def slider(self) -> list[Comparison]:
+        """The comparisons of the slider."""
+        return [self.whole[frame] for frame in self.slider_frames]
+
+
+def empty_comparisons(clip: EvaluatedClip, settings: EvaluateSettings) -> Comparisons:
+    """Chooses the frames that are shown, evenly spaced, and finds the person in them."""
+    scored = clip.split.test or evenly(clip.split.train, settings.training_frames)
+    frames = evenly(scored, settings.comparison_frames)
+    slider = sorted({*(evenly(scored, settings.slider_frames) if settings.slider_frames else []), *frames})
+    box = person_box([clip.mask(frame) for frame in slider])
+    return Comparisons(frames, slider, box, settings.error_gain)
 
 
 def closeups(whole: Comparison, boxes: Mapping[str, Sequence[Box]]) -> list[Closeup]:
@@ -86,7 +144,7 @@ def compare(frame: int, truth: Tensor, render: Tensor, gain: float, psnr: float)
     return Comparison(frame, to_bytes(truth), to_bytes(render), to_bytes(error), psnr)
 
 
-def person_box(masks: Sequence[np.ndarray], margin: int = 16) -> tuple[int, int, int, int]:
+def person_box(masks: Sequence[np.ndarray], margin: int = 16) -> Box:
     """The box (left, top, right, bottom) around the person in all of the masks, [H, W] uint8.
 
     The whole image where no mask shows anyone.
@@ -136,3 +194,36 @@ def caption(text: str, width: int) -> np.ndarray:
     scale *= min(1.0, max(width - 8, 1) / length)
     cv2.putText(band, text, (4, _BAND - 9), cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
     return band
+
+
+def cover_pictures(avatar: AvatarMethod, frame: int, relaxed: Gaussians) -> list[np.ndarray]:
+    """The report's cover: as filmed, the avatar in that pose, the avatar turned to either side.
+
+    Args:
+        avatar: shows the frame.
+        frame: the one that is shown.
+        relaxed: the avatar in the pose of the turntable.
+
+    Returns:
+        Four pictures [H, W, 3] uint8 RGB of one height, the first and the last two of one width.
+    """
+    left, top, right, bottom = person_box([avatar.clip.mask(frame)])
+    pair = (avatar.clip.frame(frame), on_grey(avatar.rendering(frame)))
+    cut = [picture[top:bottom, left:right] for picture in pair]
+    return [resized(one, COVER_HEIGHT) for one in (*cut, *both_sides(relaxed))]
+
+
+@torch.no_grad()
+def both_sides(gaussians: Gaussians) -> list[np.ndarray]:
+    """The avatar from its right and from its left, 40 degrees off the front, cut to what is seen."""
+    cameras = orbit(visible_extent(gaussians), 480, 640, 9)
+    renderings = [render(gaussians, camera) for camera in (cameras[-1], cameras[1])]
+    masks = [(rendering.alpha.clamp(0, 1) * 255).byte().numpy() for rendering in renderings]
+    left, top, right, bottom = person_box(masks)
+    return [on_grey(rendering)[top:bottom, left:right] for rendering in renderings]
+
+
+def on_grey(rendering: Rendering) -> np.ndarray:
+    """The picture for people: dark hair and a white shirt both stand out; [H, W, 3] uint8 RGB."""
+    image = rendering.color + (1 - rendering.alpha[..., None]) * GREY
+    return to_bytes(image)
