@@ -3,7 +3,7 @@
 What a new frame costs, posing and drawing, of an avatar as it was trained and of the same one baked
 (``pipeline.avatar.bake``), laid out as the paper's runtime table: the number of Gaussians, the asset (a
 Gaussian's mean, opacity, scale, rotation and colour in float32, in MiB), animation, rendering, their sum and
-frames a second. Both take turns in one process. The baked avatar's file is given beside.
+frames a second. Both take turns in one process.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import argparse
 import dataclasses
 import json
 import statistics
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,7 @@ import torch
 from benchmarks.avatars import Pose, avatar_camera, avatar_of, poses_of
 from benchmarks.machine import described, prepare
 from pipeline.avatar import Architecture, Avatar
-from pipeline.avatar.bake import BakedAvatar, bake, save_baked
+from pipeline.avatar.bake import BakedAvatar, bake
 from pipeline.splat import Gaussians, render
 
 COUNTS, SIZES = (10_000, 40_000, 167_000), (256, 512)
@@ -32,7 +31,7 @@ POSES = 4  # taken in turn
 PAPERS = Architecture(residual_parts=("face", "left_hand", "right_hand"))
 CLOCKS = ("wall", "cpu")
 EACH_FRAME, UNBAKED, BAKED = "decoded each frame", "unbaked", "baked"
-WIDTHS = (10, 7, 20, 10, 10, 10, 10, 10, 10, 8)
+WIDTHS = (10, 7, 20, 10, 10, 10, 10, 10, 8)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +43,6 @@ class Timing:
         gaussians: their number.
         size: pixels along a side of the picture.
         asset_mib: of one frame's Gaussians.
-        file_mib: of what must be loaded; 0 where it was not written.
         animation, rendering: wall-clock and CPU time of every frame.
     """
 
@@ -52,7 +50,6 @@ class Timing:
     gaussians: int
     size: int
     asset_mib: float
-    file_mib: float
     animation: tuple[tuple[float, float], ...]
     rendering: tuple[tuple[float, float], ...]
 
@@ -70,7 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
     counts, sizes = options.gaussians or counts, options.sizes or sizes
     clock = CLOCKS.index(options.clock)
     print(f"{described()}; least ms of {options.clock} time")
-    print(_row("#G", "image", "", "asset MB", "file MB", "anim", "median", "rend", "total", "FPS"))
+    print(_row("#G", "image", "", "asset MB", "anim", "median", "rend", "total", "FPS"))
     timings: list[Timing] = []
     for count in counts:
         avatar = avatar_of(count, PAPERS).eval()
@@ -121,19 +118,10 @@ def _race(avatar: Avatar, baked: BakedAvatar, size: int, repeats: int) -> list[T
             end = _now()
             if repeat > 0:  # the first turn compiles and warms up
                 times[name].append((_passed(start, middle), _passed(middle, end)))
-    sizes = {BAKED: _file_mib(baked)}
     asset = sum(tensor.numel() * tensor.element_size() for tensor in gaussians.tensors()) / 2**20
     return [
-        Timing(name, len(avatar), size, asset, sizes.get(name, 0.0), *zip(*pairs, strict=True))
-        for name, pairs in times.items()
+        Timing(name, len(avatar), size, asset, *zip(*pairs, strict=True)) for name, pairs in times.items()
     ]
-
-
-def _file_mib(baked: BakedAvatar) -> float:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "baked.safetensors"
-        save_baked(path, baked)
-        return path.stat().st_size / 2**20
 
 
 def _lines(timings: list[Timing], clock: int) -> Iterator[str]:
@@ -146,7 +134,6 @@ def _lines(timings: list[Timing], clock: int) -> Iterator[str]:
             f"{timing.size}²",
             timing.contestant,
             f"{timing.asset_mib:.2f}",
-            f"{timing.file_mib:.1f}" if timing.file_mib else "",
             *milliseconds,
             f"{1e3 / total:.1f}",
         )

@@ -32,7 +32,7 @@ from pipeline.job import Job, job_from_words
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
-from pipeline.visibility import authors_threshold, evidence_threshold
+from pipeline.visibility import evidence_threshold
 from stages.plan.measure import read_clip, visibility
 from stages.train import run as training
 from stages.train.gate import Gate
@@ -50,7 +50,6 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "late": {"early_gate": False},
     "fixed 0.4": {"gate_threshold": 0.4},
     "fixed 0.6": {"gate_threshold": 0.6},
-    "authors": {"gate_guard": "authors"},
 }
 
 
@@ -178,11 +177,10 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
 
 
 def lines(subject: Subject) -> dict[str, Any]:
-    """Where our test and the authors' guards draw the line, from fitted poses."""
+    """Where the line is drawn, from fitted poses."""
     clip = read_clip(subject.folders["ingest"], subject.folders["fit"], subject.inputs.body)
     scores, _ = visibility(clip)
-    found = {"ours": evidence_threshold(scores), "authors": authors_threshold(scores)}
-    return {"subject": subject.name, **{name: dataclasses.asdict(line) for name, line in found.items()}}
+    return {"subject": subject.name, **dataclasses.asdict(evidence_threshold(scores))}
 
 
 def print_rows(rows: list[dict[str, Any]]) -> None:
@@ -211,15 +209,13 @@ def print_plans(subjects: list[Subject]) -> None:
 
 
 def print_lines(found: list[dict[str, Any]]) -> None:
-    """Where the line is drawn, ours and the authors'."""
-    print("\n| subject | Otsu | eta | mu_0 | ours: tau | cut | lost | authors: tau | cut | lost | why |")
-    print("|---" * 11 + "|")
+    """Where the line is drawn, and why."""
+    print("\n| subject | Otsu | eta | mu_0 | tau | cut | lost | why |")
+    print("|---" * 8 + "|")
     for one in found:
-        mine, theirs = one["ours"], one["authors"]
-        cells = [f"{mine['otsu']:.2f}", f"{mine['separability']:.2f}", f"{mine['low_mean']:.3f}"]
-        for line in (mine, theirs):
-            cells += [f"{line['tau']:.2f}", f"{line['cut']:.1%}", f"{line['lost']:.2%}"]
-        print(f"| {one['subject']} | {' | '.join(cells)} | {theirs['why']} |")
+        cells = [f"{one['otsu']:.2f}", f"{one['separability']:.2f}", f"{one['low_mean']:.3f}"]
+        cells += [f"{one['tau']:.2f}", f"{one['cut']:.1%}", f"{one['lost']:.2%}"]
+        print(f"| {one['subject']} | {' | '.join(cells)} | {one['why']} |")
 
 
 def headline(rows: list[dict[str, Any]]) -> str:

@@ -3,7 +3,7 @@
 A score v_i is the share of the frames that show vertex i. The paper draws the line at Otsu's threshold
 tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu
 draws a line all the same, through what is healthy. ``evidence_threshold`` tells the two apart by what a
-line costs; ``authors_threshold`` is the test of the authors' release, for comparison.
+line costs.
 
 **The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
 frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /
@@ -17,12 +17,6 @@ sum of all scores``. A line is drawn only where
 Where Otsu's own line fails, Otsu is asked again about the scores under it, and so on: with three modes
 (legs never, hands now and then, the face always) the first line may cut off the hands, and the second
 one leaves them.
-
-The guards of the authors' release are mu_0 < 0.10, the mean of the lower class; eta >= 0.60, the share of
-the variance that lies between the classes; and 5% to 95% of the vertices under the line. The second one
-stops nothing: a normal distribution has eta = 2 / pi = 0.64 and a uniform one 0.75. The first one does
-the work, and asks for the mean of a class in which never-seen vertices outvote the others: whether hands
-that half of the frames show are cut off then hangs on how many legs are out of the picture.
 """
 
 from __future__ import annotations
@@ -40,7 +34,6 @@ from pipeline.camera import Camera, project, to_camera
 BINS = 256
 NEAR = 0.2  # metres: what is nearer to the camera is not in the picture, as in the authors' release
 LARGEST_LOSS, LARGEST_VALLEY, LEAST_CUT = 0.01, 0.1, 0.05
-LARGEST_LOW_MEAN, LEAST_SEPARABILITY, CUT_RANGE = 0.10, 0.60, (0.05, 0.95)  # the authors' guards
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,23 +153,6 @@ def _why_open(tau: float, cut: float, lost: float) -> str:
     if cut < LEAST_CUT:
         return f"only {cut:.1%} of the body is seen less often than the rest"
     return f"a line at {tau:.2f} would take {lost:.1%} of what is seen, and there is no valley under it"
-
-
-def authors_threshold(scores: np.ndarray) -> Line:
-    """Otsu's line, where the guards of the authors' release let it pass."""
-    tau, separability, low_mean = otsu(histogram(scores))
-    cut, lost = cost(scores, tau)
-    failed = [
-        text
-        for fails, text in (
-            (low_mean >= LARGEST_LOW_MEAN, f"mu_0 = {low_mean:.2f}"),
-            (separability < LEAST_SEPARABILITY, f"eta = {separability:.2f}"),
-            (not CUT_RANGE[0] <= cut <= CUT_RANGE[1], f"{cut:.1%} cut"),
-        )
-        if fails
-    ]
-    why = f"open: {', '.join(failed)}" if failed else "mu_0, eta and the cut pass"
-    return Line(0.0 if failed else tau, tau, separability, low_mean, cut, lost, why)
 
 
 def fixed_threshold(scores: np.ndarray, tau: float) -> Line:

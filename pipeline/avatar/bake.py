@@ -9,13 +9,9 @@ neither the triplane nor the body model is needed any more. Posing has no gradie
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
 
 import roma
-import safetensors
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decoded, pose_features
@@ -24,13 +20,7 @@ from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import encode, time_code
 from pipeline.body import Pose, joint_transforms
-from pipeline.errors import UserError
 from pipeline.splat import Gaussians
-
-FORMAT = "flexiavatar-baked-1"
-HEADS = ("geometry", "color")
-# Fields that JSON holds.
-PLAIN = ("opacity", "place_frequencies", "time_frequencies", "posed_place", "residual_unit")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,72 +248,3 @@ def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
         offset_unit=sizes.pose_offset_unit * decoded.surface.pliable,
         joints=canonical.joints,
     )
-
-
-def save_baked(path: Path, baked: BakedAvatar) -> None:
-    """Writes a baked avatar as one safetensors file; equal ones give equal bytes."""
-    tensors = {f"constants.{name}": value for name, value in vars(baked.constants).items()}
-    tensors |= {f"rig.{name}": value for name, value in vars(baked.rig).items()}
-    tensors["time_range"] = baked.time_range
-    heads = {name: getattr(baked, name) for name in HEADS if getattr(baked, name) is not None}
-    for part, residual in baked.residuals.items():
-        tensors[f"residual.{part}.rows"] = residual.rows
-        heads[f"residual.{part}"] = residual.head
-    for name, head in heads.items():
-        layers = enumerate(head.layers.flat())
-        tensors |= {f"{name}.{field}": getattr(head, field) for field in ("products", "condition", "own")}
-        tensors |= {f"{name}.layers.{place}": tensor for place, tensor in layers}
-    header = {
-        "format": FORMAT,
-        "parents": baked.parents,
-        "groups": {name: head.layers.groups for name, head in heads.items()},
-        **{name: getattr(baked, name) for name in PLAIN if name != "residual_unit" or baked.residual_unit},
-    }
-    # One entry only: safetensors writes several in an order of its own, different in each process.
-    save_file(
-        {name: tensor.contiguous() for name, tensor in tensors.items()},
-        path,
-        {"baked": json.dumps(header, sort_keys=True)},
-    )
-
-
-def load_baked(path: Path) -> BakedAvatar:
-    """Reads a baked avatar; neither the avatar's own file nor a body model is needed.
-
-    Raises:
-        UserError: if the file is no baked avatar, or is damaged.
-    """
-    try:
-        with safetensors.safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("baked", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise UserError(f"{path} cannot be read ({error}); bake the avatar again") from error
-    if header.get("format") != FORMAT:
-        raise UserError(f"{path} is not a baked avatar of this version; bake the avatar again")
-    heads = {name: _read_head(tensors, name, groups) for name, groups in header["groups"].items()}
-    parts = [name.removeprefix("residual.") for name in heads if name.startswith("residual.")]
-    return BakedAvatar(
-        constants=Constants(**_under("constants.", tensors)),
-        rig=Rig(**_under("rig.", tensors)),
-        parents=tuple(header["parents"]),
-        geometry=heads.get("geometry"),
-        color=heads.get("color"),
-        residuals={
-            part: BakedResidual(tensors[f"residual.{part}.rows"], heads[f"residual.{part}"]) for part in parts
-        },
-        time_range=tensors["time_range"],
-        **{name: header[name] for name in PLAIN if name in header},
-    )
-
-
-def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose name begins so, by the rest of it."""
-    return {name.removeprefix(prefix): one for name, one in tensors.items() if name.startswith(prefix)}
-
-
-def _read_head(tensors: dict[str, Tensor], name: str, groups: int) -> BakedHead:
-    own = _under(f"{name}.", tensors)
-    flat = _under("layers.", own)
-    layers = Layers.from_flat(tuple(flat[str(place)] for place in range(len(flat))), groups)
-    return BakedHead(own["products"], own["condition"], own["own"], layers)

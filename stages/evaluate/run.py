@@ -70,7 +70,6 @@ from stages.evaluate.upstream import (
     StageRecord,
     fit_error,
     fit_seconds,
-    plan_savings,
     read_gate,
     stage_records,
 )
@@ -102,7 +101,9 @@ def run(context: Context) -> None:
         scorer,
         mesh=mesh,
         second=second_mask(context, clip),
-        embedder=FaceReader(context.assets["dlib"], context.assets["identity"]) if settings.identity else None,
+        embedder=FaceReader(context.assets["dlib"], context.assets["identity"])
+        if settings.identity
+        else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         start=start,
     )
@@ -320,7 +321,7 @@ def report_contents(
         registration_plots=plot_registration(registration, fit_seconds(fit)),
         visibility_plots=plot_visibility(gate.scores, gate.tau),
         visibility_picture=train / "visibility.png",
-        plan=plan_rows(plan, plan_savings(train)),
+        plan=plan_rows(plan),
         gate=gate.why,
         refinement_cost=refinement_cost(context, refined),
         omissions=omissions(clip.footage, clip.split, settings, table, gate, plan, refined),

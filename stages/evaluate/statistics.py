@@ -109,9 +109,7 @@ def means_by_camera(table: pd.DataFrame, metrics: Sequence[str]) -> dict[str, Me
     cameras = sorted(set(table.loc[table["split"] == VIEWS, "view"]))
     if (table["view"] == OTHER_CAMERA).any():
         cameras += ["", OTHER_CAMERA]
-    return {
-        camera or "training camera": means(table[table["view"] == camera], metrics) for camera in cameras
-    }
+    return {camera or "training camera": means(table[table["view"] == camera], metrics) for camera in cameras}
 
 
 def bounds(metric: str) -> tuple[float, float]:

@@ -80,7 +80,9 @@ def refine(
     return RefinedTestPoses(poses, tuple(stopped), steps)
 
 
-def frame_loss(clip: EvaluatedClip, animate: Animate, background: str, frame: int) -> Callable[[Pose], Tensor]:
+def frame_loss(
+    clip: EvaluatedClip, animate: Animate, background: str, frame: int
+) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
     camera, seconds = clip.camera(frame), clip.seconds.get(frame)
     truth = clip.person(frame, background)

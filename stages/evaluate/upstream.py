@@ -113,13 +113,6 @@ def read_gate(train: Path) -> GateRecord:
     )
 
 
-def plan_savings(train: Path) -> dict[str, dict[str, float]]:
-    """Seconds or Gaussians that each effect that was left out saved train; empty where not recorded."""
-    timings = _read(train / RUN).get("timings")
-    found = timings.get("saved") if isinstance(timings, dict) else None
-    return {name: each for name, each in (found or {}).items() if isinstance(each, dict)}
-
-
 def fit_error(fit: Path) -> float | None:
     """The mean reprojection error of the fit on trusted keypoints, pixels; None where there is none.
 

@@ -52,7 +52,9 @@ def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
         summary: what ``summary.json`` holds.
         coverage: of the person by the clip.
     """
-    return [sentence for sentence in (quality(summary), limits(summary, coverage), turned(coverage)) if sentence]
+    return [
+        sentence for sentence in (quality(summary), limits(summary, coverage), turned(coverage)) if sentence
+    ]
 
 
 def quality(summary: Mapping[str, Any]) -> str:
@@ -122,7 +124,9 @@ def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
 
 def turned(coverage: ClipCoverage) -> str:
     """The sentence on what the avatar shows when it is turned; empty where nothing is missing."""
-    hollow = f"{100 * coverage.unmodelled:.0f}% of the body was hardly ever in the picture and has no Gaussians"
+    hollow = (
+        f"{100 * coverage.unmodelled:.0f}% of the body was hardly ever in the picture and has no Gaussians"
+    )
     behind = [azimuth for azimuth in coverage.azimuths if 90 < azimuth % 360 < 270]
     if len(coverage.azimuths) and behind:
         count = f"{len(coverage.azimuths)} of {360 // AZIMUTH_STEP} directions"

@@ -1,13 +1,9 @@
 """The visibility gate: what is seen too seldom takes no part in training (paper, Section 3.4).
 
-Each drawn frame says of each body vertex whether it shows it, by one of two definitions:
+Each drawn frame shows the body vertices that lie in the crop around the person and in front of the camera.
+That is measured for gated vertices as for all others, by posing the bare body, which costs a millisecond.
 
-- ``in_frame``: the vertex lies in the crop around the person and in front of the camera. It is measured
-  for gated vertices as for all others, by posing the bare body, which costs a millisecond.
-- ``contributes``: its Gaussian has blending weight in the rendering. Gated ones are in no rendering; the
-  bare body is rendered in every ``PROBE``-th drawn frame for them alone.
-
-The score v_i is the share of the frames looked at (Eq. 7), over captured and generated frames apart, from
+The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a line is drawn through
 the captured frames' scores (:mod:`pipeline.visibility`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
@@ -27,12 +23,11 @@ import pyarrow as pa
 import torch
 from torch import Tensor, nn
 
-from pipeline.avatar import Avatar, Surface
+from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.records import write_json
-from pipeline.splat import render
 from pipeline.tables import write_table
-from pipeline.visibility import Line, authors_threshold, body_in_frame, evidence_threshold, fixed_threshold
+from pipeline.visibility import Line, body_in_frame, evidence_threshold, fixed_threshold
 from stages.train.data import View
 from stages.train.poses import FramePose
 from stages.train.settings import TrainSettings
@@ -46,7 +41,7 @@ SCHEMA = pa.schema(
         ("kept", pa.bool_()),
     ]
 )
-PROBE = 8  # drawn frames for one in which gated vertices are looked for, where that needs a rendering
+DEFINITION = "in_frame"  # what counts as seen, for gate.json
 CAPTURED, GENERATED = 0, 1
 
 
@@ -54,16 +49,17 @@ class Gate(nn.Module):
     """The scores of one run, and the line through them.
 
     Attributes:
-        hits, looked: [2, K] int64, how many drawn frames showed each of the avatar's body vertices, and how
-            many were looked at; captured and generated frames.
-        lined_hits, lined_looked: the same when the last line was drawn, for a run that goes on from a
+        hits: [2, K] int64, how many drawn frames showed each of the avatar's body vertices; captured and
+            generated frames.
+        drawn: [2] int64, how many frames were drawn.
+        lined_hits, lined_drawn: the same when the last line was drawn, for a run that goes on from a
             checkpoint after it.
     """
 
-    hits: Tensor
-    looked: Tensor
-    lined_hits: Tensor
-    lined_looked: Tensor
+    hits: Tensor  # [2, K]
+    drawn: Tensor  # [2]
+    lined_hits: Tensor  # [2, K]
+    lined_drawn: Tensor  # [2]
 
     def __init__(self, avatar: Avatar, vertices: int, settings: TrainSettings):
         """Counts nothing yet.
@@ -75,9 +71,10 @@ class Gate(nn.Module):
         """
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
-        for name in ("hits", "looked", "lined_hits", "lined_looked"):
-            counts = torch.zeros(2, len(avatar.kept), dtype=torch.long, device=avatar.device)
-            self.register_buffer(name, counts)
+        for name, shape in (("hits", (2, len(avatar.kept))), ("drawn", (2,))):
+            for prefix in ("", "lined_"):
+                counts = torch.zeros(shape, dtype=torch.long, device=avatar.device)
+                self.register_buffer(prefix + name, counts)
         self._first = avatar.active.clone()  # what is trained while the gate stays open
 
     @property
@@ -86,37 +83,20 @@ class Gate(nn.Module):
         return self._avatar[0]
 
     @torch.no_grad()
-    def watch(self, surface: Surface, position: int, pose: FramePose, view: View, weights: Tensor) -> None:
+    def watch(self, pose: FramePose, view: View) -> None:
         """Counts what one drawn frame shows.
 
         Args:
-            surface: what was rendered.
-            position: which draw of the run it was.
             pose: in which it was rendered.
             view: the frame.
-            weights: [N], the Gaussians' blending weights.
         """
         source = GENERATED if view.generated else CAPTURED
-        if self._settings.gate_definition == "in_frame":
-            self.hits[source] += body_in_frame(
-                self.avatar.surfaces[0], pose.rotation, pose.transl, view.camera
-            )
-            self.looked[source] += 1
-            return
-        count = len(self.avatar.kept)
-        rows = torch.arange(count, device=weights.device) if surface.rows is None else surface.rows
-        drawn = rows < count  # the Gaussians at the body's own vertices, on whichever level
-        self.hits[source, rows[drawn]] += weights[: len(rows)][drawn] > 0
-        self.looked[source, rows[drawn]] += 1
-        if position % PROBE == 0 and not bool(self.avatar.active.all()):
-            bare = self.avatar.bare(self.avatar.surfaces[0], pose.rotation, pose.expression, pose.transl)
-            gated = ~self.avatar.active
-            self.hits[source] += gated & (render(bare, view.camera).weights > 0)
-            self.looked[source] += gated
+        self.hits[source] += body_in_frame(self.avatar.surfaces[0], pose.rotation, pose.transl, view.camera)
+        self.drawn[source] += 1
 
     def scores(self) -> Tensor:
         """v_i of the avatar's body vertices, captured and generated: [2, K] in [0, 1]."""
-        return self.hits / self.looked.clamp_min(1)
+        return self.hits / self.drawn.clamp_min(1)[:, None]
 
     def whole_body(self, values: Tensor) -> np.ndarray:
         """What is known of the avatar's vertices, [K], over the whole body, [V] float64; else 0."""
@@ -133,12 +113,12 @@ class Gate(nn.Module):
     @property
     def line(self) -> Line | None:
         """The last line that was drawn; None before the warm-up has ended."""
-        return self._drawn()[0] if bool(self.lined_looked.any()) else None
+        return self._drawn()[0] if bool(self.lined_drawn.any()) else None
 
     def update(self) -> Line:
         """Draws the line and gates what lies below it."""
         self.lined_hits.copy_(self.hits)
-        self.lined_looked.copy_(self.looked)
+        self.lined_drawn.copy_(self.drawn)
         line, active = self._drawn()
         faces, rings = self.avatar.surfaces[0].canonical.faces, self._settings.gate_rings
         self.avatar.gate(dilate(active, faces, rings) if line.closed else self._first)
@@ -146,11 +126,11 @@ class Gate(nn.Module):
 
     def _drawn(self) -> tuple[Line, Tensor]:
         """The line through the scores as they were, and what lies above it."""
-        captured, generated = self.lined_hits / self.lined_looked.clamp_min(1)
+        captured, generated = self.lined_hits / self.lined_drawn.clamp_min(1)[:, None]
         line = self._line(self.whole_body(captured))
         active = captured >= line.tau
         if self._settings.unseen == "generated":
-            active |= (generated >= line.tau) & (self.lined_looked[GENERATED] > 0)
+            active |= (generated >= line.tau) & (self.lined_drawn[GENERATED] > 0)
         if line.closed and not bool(active.any()):
             why = f"a line at {line.tau:.2f} would gate all of the body, so none is drawn"
             line = dataclasses.replace(line, tau=0.0, why=why)
@@ -160,7 +140,7 @@ class Gate(nn.Module):
         settings = self._settings
         if settings.gate_threshold is not None:
             return fixed_threshold(scores, settings.gate_threshold)
-        return authors_threshold(scores) if settings.gate_guard == "authors" else evidence_threshold(scores)
+        return evidence_threshold(scores)
 
     def write(self, folder: Path) -> tuple[np.ndarray, np.ndarray]:
         """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the line.
@@ -178,8 +158,8 @@ class Gate(nn.Module):
         )
         line = self.line or self._line(self.whole_body(captured))
         content = dataclasses.asdict(line) | {
-            "definition": self._settings.gate_definition,
-            "drawn": {"captured": int(self.looked[CAPTURED].max()), "generated": int(self.looked[1].max())},
+            "definition": DEFINITION,
+            "drawn": {"captured": int(self.drawn[CAPTURED]), "generated": int(self.drawn[GENERATED])},
         }
         write_json(folder / "gate.json", content)
         return self.whole_body(torch.maximum(captured, generated)), self.whole_body(self.avatar.active) == 1

@@ -71,21 +71,6 @@ def over(color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
     return color + (1 - alpha)[..., None] * background
 
 
-def trust(alpha: Tensor, band: int) -> Tensor:
-    """How far a mask is to be believed at each pixel, [H, W] -> [H, W] in [0, 1].
-
-    ``1 - 4 a (1 - a)``, one minus the scaled variance of a coin with the mask's mean a over the
-    surrounding square: 0 on the silhouette, 1 where all of the square agrees.
-
-    Args:
-        alpha: [H, W], a soft mask.
-        band: pixels on either side of the silhouette that are in doubt; the square has
-            ``2 band + 1`` pixels a side.
-    """
-    mean = functional.avg_pool2d(alpha[None], 2 * band + 1, 1, band, count_include_pad=False)[0]
-    return 1 - 4 * mean * (1 - mean)
-
-
 def believed(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     """The image moved towards the target where the target is in doubt, [H, W, 3].
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Avatar, Decoded, Posed, Surface
+from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.device import moved
 from pipeline.metrics import Lpips
 from pipeline.splat import Rendering, render
@@ -22,8 +22,8 @@ from stages.train.settings import TrainSettings
 from stages.train.sight import Sight
 
 Terms = dict[str, Tensor]
-Watch = Callable[[Surface, int, FramePose, View, Tensor], None]
-"""What was rendered, which draw of the run, the pose, the frame, each Gaussian's blending weight."""
+Watch = Callable[[FramePose, View], None]
+"""Told of a drawn frame: the pose in which it was rendered, and the frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Objective:
         rendering = render(posed.gaussians, view.camera)
         self.sight.note(draw.frame, level, rendering.weights, decoded.surface.rows)
         if self.watch is not None:
-            self.watch(decoded.surface, draw.position, pose, view, rendering.weights)
+            self.watch(pose, view)
         terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
         if settings.face and not view.generated:
             terms["face"] = settings.face * self._face_term(decoded, posed, view)
@@ -174,8 +174,6 @@ class Objective:
         settings = self.settings
         image = losses.over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
-        if settings.mask_band:
-            image = losses.believed(image, target, losses.trust(view.alpha, settings.mask_band))
         if view.trust is not None:
             image = losses.believed(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)

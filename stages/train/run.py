@@ -25,7 +25,6 @@ from pipeline.stage import Context
 from pipeline.threads import threads
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.clock import Clock
-from stages.train.costs import saved
 from stages.train.data import Frames
 from stages.train.divergence import WATCHED, require_progress
 from stages.train.gate import Gate, write_ungated
@@ -112,7 +111,6 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     train(trainer, inputs, context, compiled)
     trainer.require_finite()
     publish(trainer, inputs, context)
-    context.timing("saved", saved(avatar, len(inputs.body.v_template), context.settings, settings))
 
 
 def publish(trainer: Trainer, inputs: Inputs, context: Context) -> None:
@@ -174,7 +172,7 @@ def prepare(
     if settings.initial_color or settings.face:
         chosen = spread(inputs.split.train, settings.color_frames)
         made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
-        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, settings.mask_band, made)
+        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)

@@ -12,8 +12,6 @@ NETWORKS = ("alex", "vgg")
 PLACES = ("canonical", "posed")
 SKINNINGS = ("own", "nearest")
 DEVICES = ("auto", "cpu", "cuda")
-DEFINITIONS = ("in_frame", "contributes")
-GUARDS = ("evidence", "authors")
 UNSEEN = ("nothing", "base", "generated")
 PARTS = (
     "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg",
@@ -31,7 +29,7 @@ FRACTIONS = (
 AMOUNTS = (
     "held_out_frames", "gate_rings", "warm_up", "crop_margin", "learning_rate", "plane_learning_rate",
     "pose_learning_rate", "offset_unit", "pose_offset_unit", "seed", "pose_noise",
-    "threads", "place_frequencies", "time_frequencies", "lpips_crop", "mask_band", "l1", "ssim", "lpips",
+    "threads", "place_frequencies", "time_frequencies", "lpips_crop", "l1", "ssim", "lpips",
     "face", "generated", "laplacian_offset", "laplacian_offset_face", "laplacian_scale",
     "laplacian_scale_face", "laplacian_color", "laplacian_color_hands", "offset", "offset_hands",
     "offset_face", "pose_offset", "hand_normal", "scale_size", "scale_size_hands", "scale_growth",
@@ -96,9 +94,7 @@ class TrainSettings:
     early_gate: bool = True  # from the start: what lies in no training frame's picture
     gate_from: float = 0.1  # fraction of the run, the warm-up, after which scores are looked at; 1: never
     gate_every: int = 50  # iterations between looks
-    gate_definition: str = "in_frame"  # what counts as seen: in_frame, or contributes to the rendering
     gate_threshold: float | None = None  # scores below are gated; none: found in the scores (Otsu)
-    gate_guard: str = "evidence"  # when Otsu is believed: evidence, or as in the authors' release: authors
     gate_rings: int = 2  # rings of neighbours added to what is left
     # What a finished avatar shows where no captured frame showed enough: nothing, base (the fitted body in
     # the colours next to it), or generated (what generated frames show, and nothing where there are none)
@@ -124,7 +120,6 @@ class TrainSettings:
     face: float = 0.0  # lambda_face; the paper's is 0.8
     generated_every: int = 5  # draws for one of a generated frame; the paper's is 2, equally often
     generated: float = 0.1  # lambda_L1, lambda_ssim and lambda_lpips on generated frames
-    mask_band: int = 0  # pixels on either side of the silhouette where the mask is in doubt; 0: believed
 
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: float = 1e3  # smoothness of static and of all offsets together
@@ -164,10 +159,7 @@ class TrainSettings:
             ("residual_width",), lambda value: value % self.groups == 0, "be divisible by train.groups"
         )
         self._require(("lpips_network",), lambda value: value in NETWORKS, f"be one of {', '.join(NETWORKS)}")
-        words = {
-            "residual_place": PLACES, "gate_definition": DEFINITIONS, "gate_guard": GUARDS, "unseen": UNSEEN,
-            "device": DEVICES,
-        }  # fmt: skip
+        words = {"residual_place": PLACES, "unseen": UNSEEN, "device": DEVICES}
         for name, known in words.items():
             self._require((name,), known.__contains__, f"be one of {', '.join(known)}")
         if self.gate_threshold is not None:

@@ -20,11 +20,11 @@ from pipeline.device import moved
 from pipeline.splat import Gaussians, render
 from pipeline.visibility import body_in_frame
 from stages.train.data import Frames
-from stages.train.losses import trust
 from stages.train.poses import PoseRefinement
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
-BELIEVED = 0.5  # trust from which a pixel has a say in first colours
+BELIEVED = 0.5  # trust from which a pixel of a generated frame has a say in first colours
+INSIDE = 0.5 + 0.125**0.5  # alpha beyond which a pixel has a say: a coin of that mean has half the variance
 THROUGH = 0.1  # of the weight in generated frames, under which what captured frames show is not the surface
 SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
 
@@ -70,7 +70,6 @@ def first_colors(
     poses: PoseRefinement,
     views: Frames,
     chosen: tuple[int, ...],
-    band: int = 0,
     made: tuple[int, ...] = (),
 ) -> Tensor:
     """Logits of the mean colour that the chosen frames show at each Gaussian, [N, 3].
@@ -84,13 +83,11 @@ def first_colors(
         poses: of every frame.
         views: the frames.
         chosen: frame numbers.
-        band: pixels on either side of the silhouette where the mask is in doubt. What is seen there
-            alone takes its neighbours' colour, not that of the background which the mask may hold.
         made: generated frames; they are asked for what no chosen frame shows.
     """
-    total, weight = _shown(avatar, poses, views, chosen, band)
+    total, weight = _shown(avatar, poses, views, chosen)
     if made:
-        total_made, weight_made = _shown(avatar, poses, views, made, band)
+        total_made, weight_made = _shown(avatar, poses, views, made)
         # A little of what lies behind shines through: a back has weight in a front view, and its colours.
         unseen = weight / len(chosen) < THROUGH * weight_made / len(made)
         total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
@@ -99,7 +96,7 @@ def first_colors(
 
 
 def _shown(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...], band: int
+    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
     """Colours that some frames show at each Gaussian, summed by blending weight, and the weights.
 
@@ -114,10 +111,10 @@ def _shown(
         colors = gaussians.colors.clone().requires_grad_()
         color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
         # All or nothing: a mean does not feel a small weight that all of its members share.
-        believed = trust(view.alpha, band) >= BELIEVED
+        believed = view.alpha > INSIDE
         if view.trust is not None:
             believed &= view.trust >= BELIEVED
-        person = (believed & (view.alpha > 0.5)).float()[..., None]
+        person = believed.float()[..., None]
         total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
         weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
     return total, weight

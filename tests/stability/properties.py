@@ -21,7 +21,7 @@ from pipeline.camera import facing_camera, project
 from pipeline.guard import finite
 from pipeline.metrics import composite, interior, psnr, ssim
 from pipeline.splat import Gaussians, render
-from pipeline.visibility import LARGEST_LOSS, authors_threshold, cost, evidence_threshold, histogram, otsu
+from pipeline.visibility import LARGEST_LOSS, cost, evidence_threshold, histogram, otsu
 from stages.fit import terms
 from stages.fit.doubt import exchanged, nonsense
 from stages.fit.initialise import continuous
@@ -92,7 +92,6 @@ def a_line_takes_no_more_than_it_may_and_never_everything(scores):
     assert (scores >= line.tau).any()
     if line.closed:
         assert line.lost <= LARGEST_LOSS
-    assert (scores >= authors_threshold(scores).tau).any()
 
 
 @property_of(SCORES, floats(0.0, 1.0))
@@ -240,12 +239,6 @@ def image_losses_are_finite_with_finite_slopes(pair):
     assert abs(float((fused - plain).detach())) < 2e-3
     (losses.l1(leaf, truth) + fused + plain).backward()
     assert leaf.grad.isfinite().all()
-
-
-@property_of(arrays(9, 7, low=0.0, high=1.0), st.integers(0, 4))
-def trust_is_a_share(alpha, band):
-    found = losses.trust(tensor(alpha), band)
-    assert found.min() >= -1e-6 and found.max() <= 1 + 1e-6
 
 
 @property_of(arrays(9, 7, low=0.0, high=1.0), st.integers(0, 40), st.floats(0, 1, exclude_max=True))

@@ -12,7 +12,6 @@ from pipeline.visibility import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
-    authors_threshold,
     cost,
     evidence_threshold,
     fixed_threshold,
@@ -54,7 +53,7 @@ def test_every_histogram_has_a_line_within_its_range(shape):
     scores = SHAPES[shape]
     tau, separability, low = otsu(histogram(scores))
     assert 0 <= tau <= 1 and 0 <= separability <= 1 + 1e-9 and 0 <= low <= tau
-    for line in (evidence_threshold(scores), authors_threshold(scores), fixed_threshold(scores, 0.5)):
+    for line in (evidence_threshold(scores), fixed_threshold(scores, 0.5)):
         values = (line.tau, line.otsu, line.separability, line.low_mean, line.cut, line.lost)
         assert np.isfinite(values).all() and line.why
         assert 0 <= line.cut <= 1 and 0 <= line.lost <= 1
@@ -66,8 +65,7 @@ def test_every_histogram_has_a_line_within_its_range(shape):
 
 def test_a_line_never_gates_everything():
     for scores in SHAPES.values():
-        for line in (evidence_threshold(scores), authors_threshold(scores)):
-            assert (scores >= line.tau).any()
+        assert (scores >= evidence_threshold(scores).tau).any()
 
 
 def test_scores_that_differ_by_rounding_give_one_line():
@@ -104,7 +102,7 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
     settings = {"gate_threshold": 1.0, "gate_from": 0.25, "gate_every": 2, "iterations": 8}
     trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
     before = int(trainer.avatar.active.sum())
-    trainer.gate.looked[:] = 10
+    trainer.gate.drawn[:] = 10
     trainer.gate.hits[:] = 9
     line = trainer.gate.update()
     assert not line.closed and "all of the body" in line.why

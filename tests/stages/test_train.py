@@ -1,9 +1,7 @@
 """The train stage on a tiny synthetic subject: what it learns, resumes, publishes and refuses."""
 
 import dataclasses
-import shutil
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.frames import write_mask
 from pipeline.plan import read_plan
 from pipeline.splat import render
 from pipeline.tables import read_table
@@ -25,8 +23,6 @@ from stages.train.loop import Trainer
 from stages.train.obey import obey
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
-READERS = ((read_frame, "frames"), (read_mask, "masks"))
-RED = np.array([255, 0, 0], np.uint8)
 PUBLISHED = {
     "avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet",
     "visibility.png",
@@ -165,28 +161,6 @@ def test_first_colors_are_near_the_truth(subject, tmp_path):
     grey = trainer_for(context_for(subject, tmp_path / "grey", initial_color=False))
     frames = inputs.split.test
     assert trainer.held_out(inputs.whole, frames) > grey.held_out(inputs.whole, frames) + 5
-
-
-def test_first_colours_leave_out_what_a_wide_mask_takes_from_the_background(subject, tmp_path):
-    shutil.copytree(subject / "ingest", tmp_path / "ingest")
-    for name in ("fit", "plan"):
-        (tmp_path / name).symlink_to(subject / name)
-    for frame in range(6):
-        picture, mask = (read(tmp_path / "ingest" / name, frame) for read, name in READERS)
-        write_frame(tmp_path / "ingest" / "frames", frame, np.where(mask[..., None] < 64, RED, picture))
-        write_mask(tmp_path / "ingest" / "masks", frame, cv2.dilate(mask, np.ones((5, 5), np.uint8)))
-    reddened = []
-    for band in (0, 3):
-        context = context_for(tmp_path, tmp_path / f"out{band}", mask_band=band)
-        inputs = stage.read_inputs(context)
-        refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
-        avatar, _ = stage.prepare(inputs, refinement, context.settings, context)
-        truth = torch.sigmoid(2 * torch.sin(9 * inputs.body.v_template[avatar.kept]))
-        change = (torch.sigmoid(avatar.base_color) - truth)[
-            stage.ever_in_frame(avatar, refinement, inputs.crops, inputs.split.train)
-        ]
-        reddened.append(float((change[:, 0] - change[:, 1:].mean(1) > 0.2).float().mean()))
-    assert 0.01 < reddened[0] and reddened[1] < 0.25 * reddened[0]
 
 
 def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):

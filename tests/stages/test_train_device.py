@@ -16,12 +16,12 @@ from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
 ALL_ON = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
-    "subdivisions": 1, "subdivide_from": 0.4, "gate_definition": "contributes", "skinning": "nearest",
+    "subdivisions": 1, "subdivide_from": 0.4, "skinning": "nearest",
     "skin_every": 3, "unseen": "base", "arm_color": 0.1, "hand_color": 0.1, "hand_normal": 0.1,
-    "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5, "mask_band": 1,
+    "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, loop, visibility, gate)
+RENDERERS = (objective, loop, visibility)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,7 @@ from pipeline.records import read_json
 from pipeline.tables import read_table
 from stages.train import run as stage
 from stages.train.checkpoint import NAME
-from stages.train.costs import saved
-from stages.train.gate import PROBE, SCHEMA, Gate
+from stages.train.gate import SCHEMA, Gate
 from stages.train.loop import Trainer
 from stages.train.obey import obey
 from stages.train.regularisers import Regularisers
@@ -54,7 +53,7 @@ def test_scores_over_epochs_are_those_of_the_frames(subject, tmp_path, trainer):
     captured, generated = trainer.gate.scores()
     # Refined poses move a vertex across the border now and then.
     assert (captured - expected).abs().max() <= 0.2 and (captured != expected).float().mean() < 0.02
-    assert trainer.gate.looked[0].unique().tolist() == [10] and not generated.any()
+    assert trainer.gate.drawn.tolist() == [10, 0] and not generated.any()
 
 
 def test_warm_up_ends_when_it_should_and_what_is_gated_is_gone(trainer):
@@ -110,12 +109,12 @@ def test_what_comes_into_view_later_returns(trainer):
     gate = trainer.gate
     hand = torch.zeros(len(trainer.avatar.kept), dtype=torch.bool)
     hand[trainer.avatar.surfaces[0].canonical.is_part("left_hand")] = True
-    gate.looked[0] = 10
+    gate.drawn[0] = 10
     gate.hits[0] = torch.where(trainer.avatar.surfaces[0].canonical.is_part("head", "face"), 10, 0)
     gate.update()
     assert not trainer.avatar.active[hand].any()
     for _ in range(30):
-        gate.looked[0] += 1
+        gate.drawn[0] += 1
         gate.hits[0] += (gate.hits[0] > 0) | hand
     gate.update()
     assert trainer.avatar.active[hand].all()
@@ -124,7 +123,7 @@ def test_what_comes_into_view_later_returns(trainer):
 def test_generated_frames_are_counted_apart_and_keep_what_they_show(trainer):
     gate, avatar = trainer.gate, trainer.avatar
     face, leg = (avatar.surfaces[0].canonical.is_part(part) for part in ("face", "left_leg"))
-    gate.looked[:] = 4
+    gate.drawn[:] = 4
     gate.hits[0], gate.hits[1] = 4 * face, 4 * leg
     gate.update()
     assert avatar.active[face].all() and avatar.active[leg].all()
@@ -133,22 +132,8 @@ def test_generated_frames_are_counted_apart_and_keep_what_they_show(trainer):
     assert avatar.active[face].all() and not avatar.active[leg].all()
 
 
-def test_contributions_are_counted_and_gated_ones_are_looked_for(subject, tmp_path):
-    changes = LATE | {"gate_definition": "contributes", "gate_from": 0.0, "gate_every": 3}
-    trainer = trainer_for(context_for(subject, tmp_path / "out", **changes))
-    for _ in range(3):
-        trainer.step()
-    gated = ~trainer.avatar.active
-    assert gated.any() and trainer.gate.looked[0, gated].unique().tolist() == [3]
-    while trainer.iteration < PROBE + 1:
-        trainer.step()
-    still = gated & ~trainer.avatar.active
-    assert int(trainer.gate.looked[0, still].min()) == 4
-    assert trainer.gate.looked[0].max() == PROBE + 1
-
-
 def test_full_body_in_view_keeps_the_gate_open(trainer):
-    trainer.gate.looked[0] = 20
+    trainer.gate.drawn[0] = 20
     trainer.gate.hits[0] = torch.randint(15, 21, trainer.gate.hits[0].shape)
     trainer.gate.update()
     assert not trainer.gate.line.closed and bool(trainer.avatar.active.all())
@@ -244,14 +229,6 @@ def test_the_mesh_is_no_finer_than_the_plan_says_unless_it_was_told_to(wanted, f
     others = [one for one in plan_of().decisions if one.effect != "subdivision"]
     settings = dataclasses.replace(TINY, subdivisions=wanted)
     assert obey(settings, Plan((*others, levels))).subdivisions == built
-
-
-def test_what_the_plan_left_out_of_the_mesh_is_said(subject, tmp_path):
-    trainer = trainer_for(context_for(subject, tmp_path / "out"))
-    wanted = dataclasses.replace(TINY, subdivisions=2)
-    count = len(trainer.avatar)
-    assert saved(trainer.avatar, count, wanted, TINY)["subdivision"] == {"gaussians": 15.0 * count}
-    assert "subdivision" not in saved(trainer.avatar, count, TINY, TINY)
 
 
 def test_without_pose_heads_there_are_none(subject, tmp_path):

@@ -113,7 +113,7 @@ def test_first_colours_of_the_unseen_side_are_the_generated_ones(objective):
 
 
 def test_a_run_publishes_captured_poses_only_and_counts_apart(subject, tmp_path):
-    context = inputs_of(subject, tmp_path / "out", gate_definition="in_frame")
+    context = inputs_of(subject, tmp_path / "out")
     stage.run(context)
     assert read_poses(context.output / "poses.parquet").frames == tuple(range(6))
     table = read_table(context.output / "visibility.parquet", SCHEMA, "")

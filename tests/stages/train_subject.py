@@ -37,7 +37,6 @@ TINY = TrainSettings(
     gate_every=2,
     residual_from=0.3,
     face=0.8,
-    mask_band=1,
 )
 
 

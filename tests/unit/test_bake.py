@@ -1,4 +1,4 @@
-"""A baked avatar shows what the avatar shows, from a file of its own."""
+"""A baked avatar shows what the avatar shows."""
 
 import dataclasses
 
@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from pipeline.avatar import Architecture, Avatar
-from pipeline.avatar.bake import bake, load_baked, save_baked
+from pipeline.avatar.bake import bake
 from pipeline.avatar.fused import Layers, decode
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import faces_of_vertices, joints_of_points, normals_of_vertices
 from pipeline.body import load_body, mean_identity, vertex_normals
 from pipeline.camera import facing_camera
-from pipeline.errors import UserError
 from pipeline.splat import render
 from pipeline.threads import threads
 from pipeline.workspace import REPOSITORY
@@ -83,7 +82,7 @@ def test_baked_residual_colours_follow_the_time(body, place):
 
 
 @pytest.mark.parametrize("place", ["canonical", "posed"])
-def test_baked_residuals_move_what_the_avatars_move(body, place, tmp_path):
+def test_baked_residuals_move_what_the_avatars_move(body, place):
     sizes = dataclasses.replace(
         WITH_RESIDUALS, residual_moves=True, residual_place=place, place_frequencies=2
     )
@@ -91,8 +90,6 @@ def test_baked_residuals_move_what_the_avatars_move(body, place, tmp_path):
     baked = bake(avatar)
     for time in (None, 1.3):
         assert_same(avatar, baked, 1e-4, time=time)
-    save_baked(tmp_path / "baked.safetensors", baked)
-    assert_same(avatar, load_baked(tmp_path / "baked.safetensors"), 1e-4, time=1.3)
     avatar.residuals_active = False
     unmoved = avatar.gaussians(*a_pose()).means
     assert (baked.gaussians(*a_pose()).means - unmoved).norm(dim=1).max() > 1e-4
@@ -116,33 +113,6 @@ def test_baked_in_half_precision_renders_as_well_as_the_avatar_in_half_precision
     lost, ours = (float((picture - pictures[0]).abs().mean()) for picture in pictures[1:])
     assert ours < 1.2 * lost + 1e-5
     assert lost > 0
-
-
-@pytest.mark.parametrize(("half", "tolerance"), [(False, 1e-5), (True, 1e-2)])
-def test_a_file_holds_all_of_it(tmp_path, body, half, tolerance):
-    avatar = an_avatar(body, WITH_RESIDUALS, half_precision=half)
-    path, again = tmp_path / "baked.safetensors", tmp_path / "again.safetensors"
-    baked = bake(avatar)
-    save_baked(path, baked)
-    loaded = load_baked(path)
-    for mine, theirs in zip(
-        loaded.gaussians(*a_pose(), time=1.0).tensors(),
-        baked.gaussians(*a_pose(), time=1.0).tensors(),
-        strict=True,
-    ):
-        # Not equal: the order of torch's sums depends on how memory is aligned.
-        torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance)
-    save_baked(again, loaded)
-    assert path.read_bytes() == again.read_bytes()
-
-
-def test_a_wrong_file_says_what_to_do(tmp_path, body):
-    path = tmp_path / "baked.safetensors"
-    with pytest.raises(UserError, match="bake the avatar again"):
-        load_baked(path)
-    path.write_bytes(b"nothing of the kind")
-    with pytest.raises(UserError, match="bake the avatar again"):
-        load_baked(path)
 
 
 @pytest.mark.parametrize(("inputs", "width", "groups"), [(12, 16, 4), (9, 24, 3), (5, 8, 1), (7, 8, 8)])

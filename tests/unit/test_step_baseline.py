@@ -101,7 +101,6 @@ def test_animation_has_a_row_a_contestant_and_a_headline(monkeypatch, capsys, tm
     timings = json.loads(path.read_text())["timings"]
     count = timings[0]["gaussians"]
     assert all(timing["asset_mib"] == 14 * 4 * count / 2**20 for timing in timings)  # as the paper counts it
-    assert [timing["file_mib"] > 0 for timing in timings] == [False, False, True]
 
 
 class Slow(torch.autograd.Function):

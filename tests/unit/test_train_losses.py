@@ -120,19 +120,9 @@ def test_size_by_hand():
     assert float(losses.size(values, 0.0)) == 0
 
 
-def test_trust_by_hand():
-    alpha = torch.tensor([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0]]).expand(5, 6)
-    none, one, all_six = torch.tensor([1.0] * 6), torch.tensor([1, 1, 1 / 9, 1 / 9, 1, 1]), torch.zeros(6)
-    torch.testing.assert_close(losses.trust(alpha, 0), none.expand(5, 6))
-    torch.testing.assert_close(losses.trust(alpha, 1), one.expand(5, 6))
-    torch.testing.assert_close(losses.trust(0.5 * torch.ones(5, 6), 2), all_six.expand(5, 6))
-    # The border of the picture is no silhouette.
-    torch.testing.assert_close(losses.trust(torch.ones(5, 6), 2), torch.ones(5, 6))
-
-
 def test_believed_image_has_the_weighted_l1_and_no_gradient_in_doubt():
     image, target = drawn(12, 13, 3).requires_grad_(), drawn(12, 13, 3, seed=1)
-    weight = losses.trust((drawn(12, 13, seed=2) > 0.5).float(), 0).clone()
+    weight = torch.ones(12, 13)
     weight[3:5] = 0.0
     weight[7] = 0.25
     value = losses.l1(losses.believed(image, target, weight), target)

@@ -170,7 +170,6 @@ def test_lpips_is_asked_for_only_where_it_has_a_weight():
         {"lpips_network": "resnet"},
         {"lpips_every": 0},
         {"face": -1.0},
-        {"mask_band": -1},
         {"residual_width": 0},
         {"residual_parts": ("tail",)},
         {"residual_place": "nowhere"},

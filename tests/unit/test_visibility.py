@@ -8,7 +8,6 @@ import torch
 from pipeline.camera import facing_camera
 from pipeline.visibility import (
     LARGEST_LOSS,
-    authors_threshold,
     cost,
     evidence_threshold,
     fixed_threshold,
@@ -55,35 +54,32 @@ def test_gate_stays_open_on_one_mode(name):
 def test_two_spikes_are_told_apart():
     line = evidence_threshold(TWO)
     assert line.closed and (line.cut, line.lost) == (0.5, 0.0)
-    assert authors_threshold(TWO).tau == line.tau
 
 
-def test_separability_of_the_release_passes_one_mode():
-    """2 / pi for a normal distribution, 3 / 4 for a uniform one: a bound of 0.60 stops neither."""
+def test_separability_of_one_mode_is_that_of_its_distribution():
+    """2 / pi for a normal distribution, 3 / 4 for a uniform one: as high as that of many a pair of modes."""
     for name, expected in (("normal", 2 / np.pi), ("uniform", 0.75)):
         assert otsu(histogram(UNIMODAL[name]))[1] == pytest.approx(expected, abs=0.02)
 
 
 def test_hands_that_come_and_go_stay_whatever_the_legs_do():
-    """The release's guard lets Otsu cut the hands off as soon as enough legs are out of the picture."""
+    """Otsu alone cuts the hands off as soon as enough legs are out of the picture."""
     for legs in (200, 2000):
         scores = modes((0.0, legs), (0.4, 100), (1.0, 400))
         line = evidence_threshold(scores)
         assert line.closed and 0 < line.tau < 0.4 and line.lost == 0
-    assert authors_threshold(scores).tau > 0.4
-    assert cost(scores, authors_threshold(scores).tau)[1] == pytest.approx(40 / 440)
+    assert line.otsu > 0.4 and cost(scores, line.otsu)[1] == pytest.approx(40 / 440)
 
 
-def test_three_modes_where_the_release_gives_up():
+def test_three_modes_are_cut_under_the_lowest_valley():
     scores = modes((0.0, 260), (0.45, 250), (1.0, 490))
     line = evidence_threshold(scores)
     assert line.closed and line.cut == pytest.approx(0.26) and line.lost == 0
-    assert not authors_threshold(scores).closed  # its mean of the lower class counts the hands
 
 
 def test_close_up_of_a_face_is_gated():
     scores = modes((0.0, 970), (1.0, 30))
-    assert evidence_threshold(scores).closed and not authors_threshold(scores).closed
+    assert evidence_threshold(scores).closed
 
 
 def test_what_one_frame_in_a_hundred_shows_is_below_the_line():

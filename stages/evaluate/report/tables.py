@@ -175,7 +175,9 @@ def _cell(summary: Mapping[str, Any], split: str, method: str, metric: str) -> N
         if ends is not None and value is not None
         else ""
     )
-    return NumberCell(number(metric, value), span, split == HELD_OUT and best(summary["means"], metric) == method)
+    return NumberCell(
+        number(metric, value), span, split == HELD_OUT and best(summary["means"], metric) == method
+    )
 
 
 def _heading(metric: str) -> tuple[str, str]:
@@ -192,7 +194,6 @@ class PlanRow:
         forced: true where a setting said so.
         measured, threshold: numbers, the latter with its unit.
         why: one sentence.
-        saved: seconds or Gaussians that leaving it out saved, where it was measured.
     """
 
     effect: str
@@ -201,34 +202,16 @@ class PlanRow:
     measured: str
     threshold: str
     why: str
-    saved: str
 
 
-def plan_rows(plan: Plan, savings: Mapping[str, Mapping[str, float]]) -> list[PlanRow]:
-    """The decisions in the order of the list of effects.
-
-    Args:
-        plan: of the subject.
-        savings: effect -> ``seconds`` or ``gaussians`` that were saved.
-    """
-    rows = []
+def plan_rows(plan: Plan) -> list[PlanRow]:
+    """The decisions in the order of the list of effects."""
+    found = []
     for effect in EFFECTS:
-        one = plan[effect]
-        threshold = f"{_three_digits(one.threshold)} {one.unit}"
-        rows.append(
-            PlanRow(
-                effect.replace("_", " "), one.on, one.forced, _three_digits(one.measured), threshold, one.why,
-                saved(savings.get(effect, {})),
-            )
-        )  # fmt: skip
-    return rows
-
-
-def saved(cost: Mapping[str, float]) -> str:
-    """A measured cost in words; empty where none was measured."""
-    if "gaussians" in cost:
-        return f"{cost['gaussians']:.0f} body vertices without a Gaussian"
-    return f"{cost['seconds']:.1f} s of training" if "seconds" in cost else ""
+        one, name = plan[effect], effect.replace("_", " ")
+        measured, threshold = _three_digits(one.measured), f"{_three_digits(one.threshold)} {one.unit}"
+        found.append(PlanRow(name, one.on, one.forced, measured, threshold, one.why))
+    return found
 
 
 def _three_digits(value: float) -> str:
