@@ -26,7 +26,7 @@ from pipeline.frames import read_frame, write_png
 from pipeline.job import job_from_words
 from pipeline.metrics import Lpips
 from pipeline.study import made
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 REAL = ("smile", "oliver", "carphone", "balance")

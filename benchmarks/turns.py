@@ -31,7 +31,7 @@ from pipeline.records import read_split
 from pipeline.splat import Gaussians, render
 from pipeline.study import made
 from pipeline.turntable import orbit, visible_extent
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}

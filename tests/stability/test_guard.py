@@ -17,7 +17,7 @@ from pipeline.guard import NotFiniteError, finite, require_finite, require_finit
 from pipeline.records import write_json
 from pipeline.stage import explain
 from pipeline.tables import write_table
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 BAD = [math.nan, math.inf, -math.inf]
 KEY = "0123456789abcdef"
