@@ -23,11 +23,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from benchmarks.avatars import Pose, avatar_camera, avatar_of, poses_of
+from benchmarks.avatars import avatar_camera, avatar_of, poses_of
 from benchmarks.machine import described, prepare
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.body import Pose
 from pipeline.camera import Camera
 from pipeline.splat import Rendering, render
 from stages.train import losses
@@ -183,8 +184,8 @@ class Contestant:
     def pose(self, decoded: Decoded, frame: Frame) -> Posed:
         """The frame's Gaussians."""
         if isinstance(self.model, Avatar) and self.seen:
-            return self.model.pose(decoded, *frame.pose.values(), rows=frame.seen)
-        return self.model.pose(decoded, *frame.pose.values())
+            return self.model.pose(decoded, frame.pose, rows=frame.seen)
+        return self.model.pose(decoded, frame.pose)
 
 
 def _photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Tensor:
@@ -214,7 +215,7 @@ def frames_of(avatar: Avatar, count: int, size: int) -> list[Frame]:
     for pose in poses_of(avatar, count):
         target = torch.rand(size, size, 3, generator=generator)
         background = torch.rand(3, generator=generator)
-        weights = render(avatar.pose(decoded, *pose.values()).gaussians, camera).weights
+        weights = render(avatar.pose(decoded, pose).gaussians, camera).weights
         frames.append(Frame(pose, camera, target, background, torch.nonzero(weights)[:, 0]))
     return frames
 

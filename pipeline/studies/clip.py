@@ -108,8 +108,7 @@ def _baked(outcome: Outcome, body_file: Path) -> BakedAvatar:
 
 
 def _posed(baked: BakedAvatar, poses, frame: int, seconds: float | None) -> Gaussians:
-    row = poses.index(frame)
-    return baked.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row], seconds)
+    return baked.gaussians(poses.pose(frame), seconds)
 
 
 def speeds(outcomes: Sequence[Outcome], clip: Clip, notes: Notes) -> dict[str, Numbers]:

@@ -181,7 +181,7 @@ def test_a_subjects_own_clip_filmed_from_where_it_was_is_the_clip_again(studio):
     original = facing_camera(48, 64, 1.2 * 64)
     for frame in (0, 5):
         with torch.no_grad():
-            there = avatar.gaussians(poses.rotation[frame], poses.expression[frame], poses.transl[frame])
+            there = avatar.gaussians(poses.pose(frame))
             ours = render(*filmed(context, frame)).color
             assert float((ours - render(there, original).color).abs().mean()) < 2e-3
     about = json.loads((context.output / "animate.json").read_text())

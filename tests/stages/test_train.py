@@ -198,7 +198,7 @@ def test_published_avatar_renders_the_held_out_frame(subject, finished):
     view = inputs.whole[5]
     with torch.no_grad():
         pose = inputs.poses
-        gaussians = avatar.gaussians(pose.rotation[5], pose.expression[5], pose.transl[5], inputs.times[5])
+        gaussians = avatar.gaussians(pose.pose(5), inputs.times[5])
         rendering = render(gaussians, view.camera)
     error = (rendering.color - view.composite(torch.zeros(3))).square().mean()
     curve_rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")

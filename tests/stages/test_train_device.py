@@ -5,7 +5,7 @@ import torch
 
 from pipeline import curves
 from pipeline.avatar import heads, load_avatar, posing
-from pipeline.body import load_body
+from pipeline.body import Pose, load_body
 from pipeline.device import moved
 from pipeline.splat import render
 from pipeline.tables import read_table
@@ -101,9 +101,9 @@ def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_
     avatars = [load_avatar(one.output / "avatar.safetensors", load_body(BODY_FILE)) for one in (here, there)]
     assert all(tensor.device.type == "cpu" for tensor in avatars[1].state_dict().values())
     assert torch.equal(avatars[0].active, avatars[1].active)
-    still = torch.zeros(55, 3), torch.zeros(5), torch.zeros(3)
+    still = Pose(torch.zeros(55, 3), torch.zeros(5), torch.zeros(3))
     with torch.no_grad():
-        colors = [avatar.gaussians(*still).colors for avatar in avatars]
+        colors = [avatar.gaussians(still).colors for avatar in avatars]
     torch.testing.assert_close(*colors, rtol=0, atol=0.03)
 
 

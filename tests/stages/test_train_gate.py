@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.avatar import load_avatar
-from pipeline.body import load_body
+from pipeline.body import Pose, load_body
 from pipeline.plan import Decision, Plan
 from pipeline.records import read_json
 from pipeline.tables import read_table
@@ -192,7 +192,7 @@ def test_finished_avatar_shows_nothing_or_the_base_where_nothing_was_seen(subjec
     kept = read_table(context.output / "visibility.parquet", SCHEMA, "")["kept"]
     expression = torch.zeros(avatar.surfaces[0].canonical.expression_directions.shape[-1])
     with torch.no_grad():
-        gaussians = avatar.gaussians(torch.zeros(55, 3), expression, torch.zeros(3))
+        gaussians = avatar.gaussians(Pose(torch.zeros(55, 3), expression, torch.zeros(3)))
     assert len(avatar) == kept.sum()
     assert len(gaussians) == (len(kept) if unseen == "base" else kept.sum())
     if unseen == "base":

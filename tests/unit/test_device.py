@@ -11,7 +11,7 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar, heads
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import plain_normals, plain_place
-from pipeline.body import joint_transforms, load_body, mean_identity
+from pipeline.body import Pose, joint_transforms, load_body, mean_identity
 from pipeline.device import DEVICES, moved, resolve
 from pipeline.errors import UserError
 from stages.train import settings
@@ -107,11 +107,11 @@ def test_a_head_in_plain_torch_is_the_fused_one_with_gradients(monkeypatch, half
 
 
 def test_an_avatar_moves_there_and_back(avatar):
-    pose = torch.zeros(55, 3), torch.zeros(5), torch.zeros(3)
+    pose = Pose(torch.zeros(55, 3), torch.zeros(5), torch.zeros(3))
     with torch.no_grad(), pretend_device():
-        before = avatar.eval().gaussians(*pose)
-        there = avatar.to(DEVICE).gaussians(*moved(pose, DEVICE))
+        before = avatar.eval().gaussians(pose)
+        there = avatar.to(DEVICE).gaussians(moved(pose, DEVICE))
         assert all(isinstance(one, Elsewhere) for one in there.tensors())
-        after = avatar.to("cpu").gaussians(*pose)
+        after = avatar.to("cpu").gaussians(pose)
     for one, other in zip(before.tensors(), after.tensors(), strict=True):
         assert torch.equal(one, other)

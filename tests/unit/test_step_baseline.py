@@ -45,7 +45,7 @@ def test_a_body_without_enough_vertices_is_refused():
 def test_straightforward_gaussians_are_ours(pair):
     avatar, plain = pair
     pose = step.frames_of(avatar, 1, 16)[0].pose
-    ours, theirs = (model.pose(model.decode(), *pose.values()) for model in pair)
+    ours, theirs = (model.pose(model.decode(), pose) for model in pair)
     for mine, other in zip(ours.gaussians.tensors(), theirs.gaussians.tensors(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-5)
     assert ours.pose_offset.abs().max() > 0

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_npz, read_pickle
-from stages.ingest.cameras.calibration import Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation, pinhole_lens
 from stages.ingest.cameras.gaps import Extrinsics
 from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
 from stages.ingest.settings import IngestSettings
@@ -52,7 +52,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     table = read_npz(path, _REMEDY)
     cameras = _cameras(table, path, list(clip.pictures))
     lens = _lens(numbers(entry(table, "intrinsic", path, _REMEDY), (3, 3), f"{path}", _REMEDY), clip)
-    views = {str(frame): View(lens, *pose) for frame, pose in cameras.items()}
+    views = {str(frame): CalibratedCamera(lens, *pose) for frame, pose in cameras.items()}
     shot = Shot(
         clip=clip,
         calibration=Calibration(path, "X-Humans", views, metric=True, upright=False),
