@@ -29,9 +29,10 @@ from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
 from pipeline.camera import Camera
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask, write_png
-from pipeline.job import Job, job_from_words, run_stage
+from pipeline.job import Job, open_job, run_stage
 from pipeline.metrics import Lpips, composite, psnr, ssim
 from pipeline.records import read_split, write_cameras
 from pipeline.splat import render
@@ -114,7 +115,7 @@ def _compared(
         "auxiliary.texture_guidance": "false", "train.held_out_frames": "0",
     }  # fmt: skip
     words |= dict(word.split("=", 1) for word in options.words)
-    base = job_from_words(f"mannequin_{framing}", words)
+    base = open_job(f"mannequin_{framing}", parse_request(words, f"mannequin_{framing}"))
     ingest, fit = _made(base, "ingest"), _made(base, "fit")
     scene = _scene(base)
     truth = folder / f"truth_{framing}"
@@ -125,7 +126,7 @@ def _compared(
         own = CONTESTANTS[name]
         if own["auxiliary.generator"] == "folder":
             own = {**own, "auxiliary.folder": str(truth), "auxiliary.check": "false"}
-        job = job_from_words(base.subject.name, {**words, **own})
+        job = open_job(base.subject.name, parse_request({**words, **own}, base.subject.name))
         for stage in ("plan", "auxiliary"):
             if stage in job.stages:
                 _made(job, stage)

@@ -22,8 +22,9 @@ import numpy as np
 
 from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
+from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, write_png
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.metrics import Lpips
 from pipeline.study import made
 from stages.evaluate.frame_metrics import Scorer
@@ -60,7 +61,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "pose refinement": {"train.refine_poses": "false"},
     "SSIM": {"train.ssim": "0"},
     "noise on the pose": {"train.pose_noise": "0"},
-    "first colours": {"train.initial_color": "false"},
+    "initial colours": {"train.initial_color": "false"},
     "smooth offsets": {"train.laplacian_offset": "0", "train.laplacian_offset_face": "0"},
     "smooth scales": {"train.laplacian_scale": "0", "train.laplacian_scale_face": "0"},
     "smooth colours": {"train.laplacian_color": "0", "train.laplacian_color_hands": "0"},
@@ -95,7 +96,7 @@ Table = dict[str, dict[str, Numbers]]
 
 def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
     """Trains one variant on one subject and scores it."""
-    job = job_from_words(subject, words)
+    job = open_job(subject, parse_request(words, subject))
     folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
     scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})

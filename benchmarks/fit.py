@@ -8,7 +8,7 @@ Three tables, of which ``--detectors``, ``--framings``, ``--variants`` and ``--n
   with measured errors: ``mediapipe`` puts unseen points outside the picture, ``heatmap`` (such as DWPose)
   inside it; ``regressor`` is heatmap's points with a regressor's poses to start from, as the paper has;
 - what posing the landmarks costs beside posing the whole mesh and picking them;
-- the effort knob: error against seconds over iterations, for each solver. ``--figure FILE`` draws it.
+- the effort knob: error against seconds over iterations. ``--figure FILE`` draws it.
 
 Seconds are of this machine and one process; the fit computes on one thread.
 """
@@ -45,8 +45,7 @@ from pipeline.threads import threads
 from stages.fit.face_offset import spread_matrix
 from stages.fit.parameters import Parameters, landmark_model, parameters_of
 from stages.fit.registration import register
-from stages.fit.settings import SOLVERS, FitSettings
-from stages.fit.solver import STEPS
+from stages.fit.settings import FitSettings
 from stages.ingest.mannequin import FRAMINGS, MannequinSpec
 
 MASKED = "masked"
@@ -83,7 +82,6 @@ class Run:
     motion: str
     identity: int
     variant: str
-    solver: str
     iterations: int
     seconds_per_100_frames: float
     errors: Errors
@@ -174,8 +172,7 @@ def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
     seconds = time.perf_counter() - started
     spec = clip.spec
     return Run(
-        clip.detector, spec.framing, Path(spec.motion).name, spec.identity, variant, settings.solver,
-        settings.iterations,
+        clip.detector, spec.framing, Path(spec.motion).name, spec.identity, variant, settings.iterations,
         100 * seconds / spec.frames,
         measure(registration.identity, registration.poses, clip, stage),
     )  # fmt: skip
@@ -205,15 +202,13 @@ def _effort_table(
 ) -> Iterator[str]:
     """Fit one clip of each framing with every effort; append the runs, yield lines."""
     names = ", ".join(clip.spec.framing for clip in clips)
-    yield f"\neffort, {clips[0].detector} keypoints, mean of one clip each of {names}"
+    yield f"\neffort in iterations, {clips[0].detector} keypoints, mean of one clip each of {names}"
     yield _row("", *COLUMNS, "s/100 fr.")
-    for solver in SOLVERS:
-        # The second-order solver takes its own number of steps, whatever is set.
-        for iterations in efforts if solver == "adam" else (STEPS,):
-            settings = dataclasses.replace(FitSettings(), iterations=iterations, solver=solver)
-            many = [fit(clip, stage, MASKED, settings) for clip in clips]
-            runs.extend(many)
-            yield _row(f"{solver} {iterations}", *_cells(many))
+    for iterations in efforts:
+        settings = FitSettings(iterations=iterations)
+        many = [fit(clip, stage, MASKED, settings) for clip in clips]
+        runs.extend(many)
+        yield _row(str(iterations), *_cells(many))
 
 
 def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
@@ -263,19 +258,15 @@ def _milliseconds(pose: Callable[[Parameters], Tensor], start: Parameters) -> fl
 
 
 def draw_effort(runs: list[Run], path: Path) -> None:
-    """Error of seen joints against seconds, a line for each solver with its iterations written beside it."""
+    """Draw the error of seen joints against seconds, the iterations written beside each point."""
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    for solver in dict.fromkeys(run.solver for run in runs):
-        efforts = sorted({run.iterations for run in runs if run.solver == solver})
-        points = [
-            _effort_point([r for r in runs if (r.solver, r.iterations) == (solver, n)]) for n in efforts
-        ]
-        axes.plot(*zip(*points, strict=True), marker="o", label=solver)
-        for iterations, point in zip(efforts, points, strict=True):
-            axes.annotate(str(iterations), point, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    efforts = sorted({run.iterations for run in runs})
+    points = [_effort_point([run for run in runs if run.iterations == effort]) for effort in efforts]
+    axes.plot(*zip(*points, strict=True), marker="o")
+    for iterations, point in zip(efforts, points, strict=True):
+        axes.annotate(str(iterations), point, textcoords="offset points", xytext=(4, 4), fontsize=8)
     axes.set(xscale="log", xlabel="seconds per 100 frames", ylabel="seen joints, mm (aligned at one joint)")
-    axes.legend()
     figure.savefig(path, dpi=150, metadata={"Software": None})
 
 

@@ -38,9 +38,10 @@ from pipeline.body import (
     rest_vertices,
     skin,
 )
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.frames import read_mask
-from pipeline.job import Job, job_from_words, run_stage
+from pipeline.job import Job, open_job, run_stage
 from pipeline.keypoints import read_keypoints
 from pipeline.records import read_cameras
 from pipeline.workspace import open_workspace
@@ -170,7 +171,7 @@ def _job(words: dict[str, str], number: int) -> Job:
         "ingest.camera_name": f"cam0{number}",
         "ingest.test_fraction": "0",
     }
-    return job_from_words("balance", {**own, **words})
+    return open_job("balance", parse_request({**own, **words}, "balance"))
 
 
 def _made(job: Job, stage: str) -> Artifact:

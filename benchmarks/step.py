@@ -203,8 +203,8 @@ def _regularisers(decoded: Decoded, posed: Posed) -> Tensor:
         + 0.02 * losses.laplacian(posed.log_scale, neighbours, same)
         + 0.002 * losses.laplacian(colors, neighbours, same)
     )
-    sizes = losses.size(posed.gaussians.scales)
-    return smooth + 10 * losses.size(decoded.offset) + 50 * losses.size(pose_offset) + 50 * sizes
+    sizes = losses.l2(posed.gaussians.scales)
+    return smooth + 10 * losses.l2(decoded.offset) + 50 * losses.l2(pose_offset) + 50 * sizes
 
 
 @torch.no_grad()

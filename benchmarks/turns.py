@@ -23,8 +23,9 @@ from benchmarks.machine import described, prepare
 from benchmarks.training import Clip, trained
 from pipeline.avatar import Avatar
 from pipeline.camera import Camera
+from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
 from pipeline.metrics.protocol import composite
 from pipeline.records import read_split
@@ -118,7 +119,7 @@ def mean(values: list[float]) -> float:
 
 def try_way(subject: str, way: str, words: dict[str, str]) -> tuple[Row, np.ndarray]:
     """Trains one way on one subject; its numbers and its sides."""
-    job = job_from_words(subject, {**words, **WAYS[way]})
+    job = open_job(subject, parse_request({**words, **WAYS[way]}, subject))
     folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
     done = trained(job)
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)

@@ -27,19 +27,20 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
+from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
 from pipeline.visibility import evidence_threshold
 from stages.plan.measure import read_clip, visibility
 from stages.train import run as training
-from stages.train.gate import Gate
+from stages.train.apply_plan import apply_plan
 from stages.train.loop import Trainer
-from stages.train.obey import obey
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
+from stages.train.visibility_gate import VisibilityGate
 
 SUBJECTS = ("mannequin_full", "mannequin_upper", "mannequin_head", "smile", "oliver", "balance")
 ALL = (*SUBJECTS, "carphone")
@@ -78,7 +79,7 @@ def open_subject(name: str) -> Subject:
     Raises:
         UserError: the store has no plan of it under the present settings.
     """
-    job = job_from_words(name, {})
+    job = open_job(name, parse_request({}, name))
     folders = {}
     for stage in ("ingest", "fit", "plan"):
         artifact = job.find(stage)
@@ -94,12 +95,12 @@ def open_subject(name: str) -> Subject:
 
 def trainer_of(subject: Subject, settings: TrainSettings, plan: Plan | None = None) -> Trainer:
     """A trainer as the stage makes it."""
-    settings = settings if plan is None else obey(settings, plan)
+    settings = settings if plan is None else apply_plan(settings, plan)
     context = SimpleNamespace(inputs=subject.folders, log=lambda line: None)
     refinement = PoseRefinement(subject.inputs.poses, subject.inputs.split.train)
     avatar, texture = training.prepare(subject.inputs, refinement, settings, context)
     vertices = len(subject.inputs.body.v_template)
-    gate = Gate(avatar, vertices, settings) if settings.gate else None
+    gate = VisibilityGate(avatar, vertices, settings) if settings.gate else None
     return Trainer(avatar, refinement, subject.inputs.evidence(texture), settings, gate=gate)
 
 
@@ -166,8 +167,9 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
             trainer.step()
         row = {"subject": subject.name, "variant": name, "seconds": time.process_time() - start}
         row |= {"gaussians": len(trainer.avatar), **scored(subject, trainer, frames, network)}
-        line = trainer.gate.line if trainer.gate is not None else None
-        row |= {"tau": line.tau if line else 0.0, "views": unseen_error(subject, trainer, options.figure)}
+        threshold = trainer.gate.threshold if trainer.gate is not None else None
+        row |= {"tau": threshold.tau if threshold else 0.0}
+        row |= {"views": unseen_error(subject, trainer, options.figure)}
         rows.append(row)
         trainers[name] = trainer
         print(f"  {subject.name} {name}: {row['psnr']:.2f} dB, {row['gaussians']} Gaussians", flush=True)
@@ -176,8 +178,8 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
     return rows
 
 
-def lines(subject: Subject) -> dict[str, Any]:
-    """Where the line is drawn, from fitted poses."""
+def threshold_of(subject: Subject) -> dict[str, Any]:
+    """The gate's threshold, from fitted poses."""
     clip = read_clip(subject.folders["ingest"], subject.folders["fit"], subject.inputs.body)
     scores, _ = visibility(clip)
     return {"subject": subject.name, **dataclasses.asdict(evidence_threshold(scores))}
@@ -208,8 +210,8 @@ def print_plans(subjects: list[Subject]) -> None:
         print(f"| {effect} | {made[0].threshold:g} {made[0].unit} | {' | '.join(cells)} |")
 
 
-def print_lines(found: list[dict[str, Any]]) -> None:
-    """Where the line is drawn, and why."""
+def print_thresholds(found: list[dict[str, Any]]) -> None:
+    """The gate's threshold of each subject, and why."""
     print("\n| subject | Otsu | eta | mu_0 | tau | cut | lost | why |")
     print("|---" * 8 + "|")
     for one in found:
@@ -261,10 +263,10 @@ def main() -> None:
     prepare("benchmarks.visibility", options.threads)
     print(described())
     subjects = [open_subject(name) for name in options.subjects]
-    result: dict[str, Any] = {"machine": described(), "rows": [], "lines": [], "gradients": {}}
+    result: dict[str, Any] = {"machine": described(), "rows": [], "thresholds": [], "gradients": {}}
     if options.only in (None, "plans"):
-        result["lines"] = [lines(one) for one in subjects]
-        print_lines(result["lines"])
+        result["thresholds"] = [threshold_of(one) for one in subjects]
+        print_thresholds(result["thresholds"])
         print_plans(subjects)
     if options.only in (None, "gradients"):
         for one in subjects:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import statistics
 from collections.abc import Mapping, Sequence
@@ -9,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifact import Artifact, Store
+from pipeline.config.request import Request
 from pipeline.datasets import Dataset, load_dataset, subjects_of
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
-from pipeline.job import job_from_words, shown, workspace_from_words
+from pipeline.job import open_job, shown
 from pipeline.protocols import ON, OWN, Protocol, chosen
 from pipeline.stage import usual
 
@@ -27,17 +29,17 @@ OURS = {
 Values = tuple[float | None, ...]
 
 
-def compare(dataset: str, words: Mapping[str, str]) -> Path:
+def compare(dataset: str, request: Request) -> Path:
     """Prints the table of a dataset and writes it to ``artifacts/compare/<dataset>.md``.
 
     Raises:
         UserError: there is no such dataset, or a result of it is damaged.
     """
-    workspace = workspace_from_words(words)
+    workspace = request.workspace
     about = load_dataset(workspace, dataset)
     subjects = subjects_of(workspace, dataset)
-    words = {name: value for name, value in words.items() if name not in ("dataset", "subject", "source")}
-    found = {subject: result_of(subject, words) for subject in subjects}
+    request = dataclasses.replace(request, subjects=())  # each is what its own file says
+    found = {subject: result_of(subject, request) for subject in subjects}
     text = table(about, subjects, {subject: one[0] for subject, one in found.items()}, notes(about, found))
     path = workspace.artifacts / "compare" / f"{dataset}.md"
     write_atomically(path, text)
@@ -46,12 +48,12 @@ def compare(dataset: str, words: Mapping[str, str]) -> Path:
     return path
 
 
-def result_of(subject: str, words: Mapping[str, str]) -> tuple[dict[str, Any] | None, bool]:
-    """A subject's ``summary.json``, and whether it is what these words would give.
+def result_of(subject: str, request: Request) -> tuple[dict[str, Any] | None, bool]:
+    """A subject's ``summary.json``, and whether it is what is asked for.
 
-    The result under these words, else the one in use, else None.
+    The result that is asked for, else the one in use, else None.
     """
-    job = job_from_words(subject, words)
+    job = open_job(subject, request)
     last = "evaluate" if "evaluate" in job.stages else usual(job.stages)[-1]
     try:
         artifact = job.find(last)
@@ -195,5 +197,5 @@ def notes(about: Dataset, found: Mapping[str, tuple[dict[str, Any] | None, bool]
         remarks.append(f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}")
     other = [subject for subject, (one, current) in found.items() if one is not None and not current]
     if other:
-        remarks.append(f"Under other settings than these words would give: {', '.join(other)}")
+        remarks.append(f"Under other settings than are asked for: {', '.join(other)}")
     return remarks

@@ -13,8 +13,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from pipeline.config.choices import BodyPart
 from pipeline.errors import UserError
 from pipeline.records import read_json, write_json
 
@@ -35,18 +36,7 @@ DECIDED = (
 )
 """Decided by the plan stage, which has a setting (``on``, ``off`` or ``auto``) of each name."""
 
-# The parts in pipeline/body/parts.py, written out: a test compares them.
-SEEN_PARTS = (
-    "seen_torso",
-    "seen_head",
-    "seen_face",
-    "seen_left_arm",
-    "seen_right_arm",
-    "seen_left_hand",
-    "seen_right_hand",
-    "seen_left_leg",
-    "seen_right_leg",
-)
+SEEN_PARTS = tuple(f"seen_{part}" for part in get_args(BodyPart))
 """Whether a part of the body is ever seen; measured as the share of training frames that show it."""
 
 EFFECTS = (*GATHERED, *DECIDED, *SEEN_PARTS)

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifact import RUN, Artifact
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words, words_to_dict
+from pipeline.job import Job, open_job
 from pipeline.process import run_stage_process
 from pipeline.stage import Stage, usual
 
@@ -87,7 +88,8 @@ def outcome_of(
     Raises:
         UserError: a setting is wrong, or a stage stopped.
     """
-    return _read(subject, variant, made(job_from_words(subject, {**words, **variant.words}), stages, log))
+    job = open_job(subject, parse_request({**words, **variant.words}, subject))
+    return _read(subject, variant, made(job, stages, log))
 
 
 def with_needed(stages: Mapping[str, Stage], wanted: Iterable[str]) -> list[str]:
@@ -154,7 +156,7 @@ def _cpu_seconds(record: Mapping[str, Any]) -> float:
 
 def _run(job: Job, stage: str, log: Path | None) -> None:
     """Runs one stage in a process of its own."""
-    reason = run_stage_process(stage, job.subject.name, words_to_dict(job.words), log)
+    reason = run_stage_process(stage, job.subject.name, job.request, log)
     if reason:
         raise UserError(f"{stage}:{job.subject.name} {reason}")
 

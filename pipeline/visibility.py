@@ -1,22 +1,21 @@
-"""How often each point of the body is seen, and where the line is drawn (paper, Section 3.4).
+"""Visibility scores of the body's vertices and the threshold under which they are gated (paper, Section 3.4).
 
-A score v_i is the share of the frames that show vertex i. The paper draws the line at Otsu's threshold
-tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu
-draws a line all the same, through what is healthy. ``evidence_threshold`` tells the two apart by what a
-line costs.
+A score v_i is the share of the frames that show vertex i. The paper's threshold is Otsu's tau*, which is
+right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu finds a threshold all
+the same, and cuts what the clip does show. ``evidence_threshold`` tells the two apart by what is lost.
 
 **The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
 frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /
-sum of all scores``. A line is drawn only where
+sum of all scores``. A threshold is used only where
 
 1. ``lost`` is at most ``LARGEST_LOSS``: no more is taken from what the clip shows;
 2. a valley lies there: scores between tau / 2 and 3 tau / 2 are at most ``LARGEST_VALLEY`` of those under
-   tau. This is the paper's own argument for Otsu, that the line could be moved without harm;
+   tau. This is the paper's own argument for Otsu, that the threshold could be moved without harm;
 3. at least ``LEAST_CUT`` of all vertices lie under it, else it is not worth its bookkeeping.
 
-Where Otsu's own line fails, Otsu is asked again about the scores under it, and so on: with three modes
-(legs never, hands now and then, the face always) the first line may cut off the hands, and the second
-one leaves them.
+Where Otsu's threshold fails, Otsu's of the scores under it is tried, and so on: with three modes (legs
+never, hands now and then, the face always) the first threshold may cut off the hands, and the second one
+leaves them.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ LARGEST_LOSS, LARGEST_VALLEY, LEAST_CUT = 0.01, 0.1, 0.05
 
 
 @dataclasses.dataclass(frozen=True)
-class Line:
-    """A threshold on scores and what it means.
+class Threshold:
+    """A threshold on scores and what it cuts.
 
     Attributes:
         tau: scores below it are gated; 0 where the gate stays open.
@@ -60,12 +59,12 @@ class Line:
 
     @property
     def closed(self) -> bool:
-        """Whether anything is gated."""
+        """True where anything is gated."""
         return self.tau > 0
 
 
 def in_frame(camera: Camera, points: Tensor) -> Tensor:
-    """Which points lie inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
+    """True for points inside the picture and in front of the camera: [N, 3] world metres -> [N] bool."""
     pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
     size = torch.tensor([camera.width, camera.height], dtype=pixels.dtype, device=pixels.device)
     return (depth > NEAR) & ((pixels >= 0) & (pixels < size)).all(1)
@@ -73,7 +72,7 @@ def in_frame(camera: Camera, points: Tensor) -> Tensor:
 
 @torch.no_grad()
 def body_in_frame(surface: Surface, pose: Pose, camera: Camera) -> Tensor:
-    """Which vertices of the posed body lie in the picture, [N] bool.
+    """True for vertices of the posed body that lie in the picture, [N] bool.
 
     Expressions and offsets are left out: they move a vertex by less than its distance to the next.
 
@@ -88,7 +87,7 @@ def body_in_frame(surface: Surface, pose: Pose, camera: Camera) -> Tensor:
 
 
 def histogram(scores: np.ndarray) -> np.ndarray:
-    """How many scores, [V] in [0, 1], lie in each of ``BINS`` equal bins: [256] int64.
+    """The histogram of scores, [V] in [0, 1], over ``BINS`` equal bins: [256] int64.
 
     Raises:
         ValueError: there is no score, or one is no share.
@@ -98,10 +97,10 @@ def histogram(scores: np.ndarray) -> np.ndarray:
     return np.bincount(np.minimum((scores * BINS).astype(np.int64), BINS - 1), minlength=BINS)
 
 
-def otsu(counts: np.ndarray) -> tuple[float, float, float]:
+def otsu_threshold(counts: np.ndarray) -> tuple[float, float, float]:
     """Otsu's threshold of a histogram over [0, 1].
 
-    Where several lines separate equally well, which is so across every gap, the middle one is taken.
+    Where several thresholds separate equally well, which is so across every gap, the middle one is taken.
 
     Args:
         counts: [256], not all zero.
@@ -121,30 +120,30 @@ def otsu(counts: np.ndarray) -> tuple[float, float, float]:
     between = np.zeros(len(low))
     between[inner] = (mean * low[inner] - first[inner]) ** 2 / (low[inner] * (1 - low[inner]))
     best = np.flatnonzero(between >= between.max() * (1 - 1e-6))
-    line = int(best[len(best) // 2])
-    return (line + 1) / len(counts), float(between.max() / variance), float(first[line] / low[line])
+    last = int(best[len(best) // 2])  # bin of the lower class
+    return (last + 1) / len(counts), float(between.max() / variance), float(first[last] / low[last])
 
 
-def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Line:
-    """Where to draw the line, if anywhere, by the test of the module's docstring.
+def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Threshold:
+    """The threshold that passes the test of the module's docstring; an open gate if none does.
 
     Args:
         scores: [V] in [0, 1], of every vertex of the body.
         largest_loss: see there.
     """
-    tau, separability, low_mean = otsu(histogram(scores))
+    tau, separability, low_mean = otsu_threshold(histogram(scores))
     first = tau
     while tau > 0:
-        cut, lost = cost(scores, tau)
+        cut, lost = share_below(scores, tau)
         if cut < LEAST_CUT:
             break
         valley = float(((scores >= tau / 2) & (scores < 1.5 * tau)).mean())
         if lost <= largest_loss and valley <= LARGEST_VALLEY * cut:
             why = f"{cut:.0%} of the body is under {tau:.2f}, and {lost:.2%} of what is seen goes with it"
-            return Line(tau, first, separability, low_mean, cut, lost, why)
-        tau = otsu(histogram(scores[scores < tau]))[0]
-    cut, lost = cost(scores, first)
-    return Line(0.0, first, separability, low_mean, cut, lost, _why_open(first, cut, lost))
+            return Threshold(tau, first, separability, low_mean, cut, lost, why)
+        tau = otsu_threshold(histogram(scores[scores < tau]))[0]
+    cut, lost = share_below(scores, first)
+    return Threshold(0.0, first, separability, low_mean, cut, lost, _why_open(first, cut, lost))
 
 
 def _why_open(tau: float, cut: float, lost: float) -> str:
@@ -155,13 +154,13 @@ def _why_open(tau: float, cut: float, lost: float) -> str:
     return f"a line at {tau:.2f} would take {lost:.1%} of what is seen, and there is no valley under it"
 
 
-def fixed_threshold(scores: np.ndarray, tau: float) -> Line:
-    """A line drawn by hand."""
-    first, separability, low_mean = otsu(histogram(scores))
-    return Line(tau, first, separability, low_mean, *cost(scores, tau), "set by hand")
+def fixed_threshold(scores: np.ndarray, tau: float) -> Threshold:
+    """A threshold set by hand."""
+    first, separability, low_mean = otsu_threshold(histogram(scores))
+    return Threshold(tau, first, separability, low_mean, *share_below(scores, tau), "set by hand")
 
 
-def cost(scores: np.ndarray, tau: float) -> tuple[float, float]:
-    """The share of vertices under a line, and the part of what is seen that goes missing with them."""
+def share_below(scores: np.ndarray, tau: float) -> tuple[float, float]:
+    """The share of vertices under a threshold, and the part of what is seen that goes missing with them."""
     under, total = scores < tau, float(scores.sum())
     return float(under.mean()), float(scores[under].sum()) / total if total else 0.0

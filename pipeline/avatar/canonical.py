@@ -1,7 +1,7 @@
 """The canonical mesh that carries the Gaussians: one a vertex (the paper's Section 3.3).
 
 The order of making it: the identity's rest mesh; the vertices that any frame can show (see
-``stages/train/visibility.py``); midpoint subdivision of what is left. The gate comes before the
+``stages/train/visibility_gate.py``); midpoint subdivision of what is left. The gate comes before the
 subdivision, so that a finer mesh is gated exactly as the coarse one was.
 
 Canonical positions are those of the rest pose, in metres, Y up, the subject's left at +X.

@@ -7,12 +7,16 @@ whatever the whole image is measured on: a mask is not quite 1 even there.
 
 from __future__ import annotations
 
+from typing import get_args
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-BLACK, WHITE = "black", "white"
+from pipeline.config.choices import Background
+
+BLACK, WHITE = get_args(Background)
 
 BACKGROUNDS = {BLACK: 0.0, WHITE: 1.0}
 """What a person can be composited on -> the value of its pixels."""

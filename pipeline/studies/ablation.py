@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifact import MANIFEST
+from pipeline.config.request import parse_request
 from pipeline.digest import write_atomically
 from pipeline.errors import UserError
-from pipeline.job import job_from_words, shown, workspace_from_words
+from pipeline.job import open_job, shown
 from pipeline.settings import read_toml
 from pipeline.stage import Progress
 from pipeline.studies.run import Ending, Failure, base_words, run_variants, scale_words, study_folder
@@ -120,7 +121,7 @@ def ablate(name: str, subjects: Sequence[str], words: Mapping[str, str]) -> Path
         UserError: a word is wrong, or nothing at all could be made.
     """
     scale_words(words)  # before anything is made
-    workspace = workspace_from_words(words)
+    workspace = parse_request(words).workspace
     folder, start = study_folder(workspace, "ablate", name), time.monotonic()
     endings = run_all(subjects, words, folder / "log.txt")
     results = Results(
@@ -162,7 +163,7 @@ def full_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
 
 def variants_of(subject: str, own: Mapping[str, str]) -> dict[str, Variant]:
     """The variants in the paper's order, and another seed."""
-    seed = job_from_words(subject, own).settings["train"].seed + 1
+    seed = open_job(subject, parse_request(own, subject)).settings["train"].seed + 1
     found = {key: Variant(label, words) for key, (label, words) in VARIANTS.items()}
     return {**found, CHANCE: Variant("another seed", {"train.seed": str(seed)})}
 
@@ -178,7 +179,7 @@ def dataset_of(workspace: Workspace, subjects: Sequence[str], words: Mapping[str
 
 def counts_refined(subject: str, words: Mapping[str, str]) -> bool:
     """Whether the settings ask for numbers with held-out poses refined, as the paper has them on NeuMan."""
-    evaluate = job_from_words(subject, full_words(subject, words)).settings["evaluate"]
+    evaluate = open_job(subject, parse_request(full_words(subject, words), subject)).settings["evaluate"]
     return evaluate.refine_test_poses == "on" or getattr(evaluate, "protocol", "") == "paper"
 
 

@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.artifact import RUN
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Found, Job, job_from_words
+from pipeline.job import Found, Job, open_job
 from pipeline.studies.design import (
     TRAIN,
     Design,
@@ -116,7 +117,9 @@ class Explorer:
 
     def job(self, point: Point) -> Job:
         """A point's job."""
-        return job_from_words(self.subject, {**self.own, **words_of(self.knobs, point)})
+        return open_job(
+            self.subject, parse_request({**self.own, **words_of(self.knobs, point)}, self.subject)
+        )
 
     def needed(self, point: Point) -> list[str]:
         """The stages of a point that the store does not hold."""
@@ -184,7 +187,9 @@ class Explorer:
         base = self.endings.get(base_of(self.knobs))
         each = base.seconds.get("fit", 0.0) if isinstance(base, Outcome) else 0.0
         for steps in fit_steps(own_steps):
-            stored = job_from_words(self.subject, {**self.own, "fit.iterations": str(steps)}).find("fit")
+            stored = open_job(
+                self.subject, parse_request({**self.own, "fit.iterations": str(steps)}, self.subject)
+            ).find("fit")
             expected = self.slowness * each * steps / own_steps
             if not stored and self.fits and self.spent + expected > self.budget / 4:
                 self.say(f"fit of {steps} steps is left out: the budget")
@@ -224,7 +229,7 @@ def presets_of(explorer: Explorer, words: Mapping[str, str], workspace: Workspac
         if not isinstance(base, Outcome):
             continue
         own = {**{key: value for key, value in words.items() if "." not in key}, "preset": path.stem}
-        job = job_from_words(explorer.subject, own)
+        job = open_job(explorer.subject, parse_request(own, explorer.subject))
         cost = expected_cost(explorer, job, base)
         left = (explorer.budget - explorer.spent) / 2
         share = sum(base.seconds.values()) / max(cost_of(base), 1e-9)

@@ -12,9 +12,10 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.artifact import RUN
+from pipeline.config.request import parse_request
 from pipeline.curves import read_curve
 from pipeline.errors import UserError
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.study import made
 from pipeline.tables import read_table, vectors
 
@@ -57,7 +58,7 @@ def fit_point(subject: str, words: Mapping[str, str], steps: int, log: Path) -> 
     Raises:
         UserError: a stage stopped.
     """
-    job = job_from_words(subject, {**words, "fit.iterations": str(steps)})
+    job = open_job(subject, parse_request({**words, "fit.iterations": str(steps)}, subject))
     folders = {stage: one.folder for stage, one in made(job, ["fit"], log).items()}
     timings = json.loads((folders["fit"] / RUN).read_text(encoding="utf-8"))["timings"]
     processor = timings.get("registration_cpu_seconds")

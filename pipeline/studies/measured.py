@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pipeline.assets import require
-from pipeline.job import job_from_words
+from pipeline.config.request import parse_request
+from pipeline.job import open_job
 from pipeline.metrics import Lpips
 from pipeline.studies.clip import Clip
 from pipeline.studies.notes import Notes
@@ -21,7 +22,7 @@ def notes_of(workspace: Workspace, subject: str) -> Notes:
 
 def clip_of(base: Outcome, words: Mapping[str, str], workspace: Workspace) -> Clip:
     """The clip of the base, on the background that evaluate composites on."""
-    own = job_from_words(base.subject, stage_words(words))
+    own = open_job(base.subject, parse_request(stage_words(words), base.subject))
     background = getattr(own.settings["evaluate"], "background", "black")
     return Clip(
         ingest=base.folders["ingest"],

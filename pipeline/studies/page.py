@@ -10,8 +10,9 @@ from pathlib import Path
 
 import jinja2
 
+from pipeline.config.request import parse_request
 from pipeline.digest import write_atomically
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.settings import as_dict
 from pipeline.studies.tables import Table
 from pipeline.study import Outcome
@@ -85,7 +86,7 @@ def settings_section(
         subject: whose.
         changed: variant -> its words.
     """
-    job = job_from_words(subject, own)
+    job = open_job(subject, parse_request(own, subject))
     each = [
         (name, " ".join(f"{key}={value}" for key, value in words.items()) or "–")
         for name, words in changed.items()

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.stage import Progress
 from pipeline.study import Outcome, Variant, outcome_of
 from pipeline.workspace import Workspace
@@ -64,7 +65,7 @@ def base_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
     """
     scaled = scale_words(words)
     own = stage_words(words)
-    settings = job_from_words(subject, {**scaled, **own}).settings
+    settings = open_job(subject, parse_request({**scaled, **own}, subject)).settings
     return {
         **lean_words(settings.get("evaluate")),
         **curve_words(settings.get("train")),

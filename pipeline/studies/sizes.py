@@ -8,7 +8,8 @@ import platform
 from collections.abc import Mapping
 
 from pipeline.artifact import MANIFEST, RUN
-from pipeline.job import job_from_words
+from pipeline.config.request import parse_request
+from pipeline.job import open_job
 from pipeline.studies.knobs import mesh_of
 from pipeline.study import Outcome
 
@@ -22,7 +23,7 @@ def sizes_of(words: Mapping[str, str], outcome: Outcome) -> str:
         words: the study's own.
         outcome: of one of its runs.
     """
-    settings = job_from_words(outcome.subject, words).settings
+    settings = open_job(outcome.subject, parse_request(words, outcome.subject)).settings
     train, ingest = settings["train"], settings["ingest"]
     side = ingest.mannequin_size if ingest.mannequin else ingest.long_side
     own = f"{train.iterations:,} iterations, {mesh_of(train, settings['plan'])}, pictures of {side} px"

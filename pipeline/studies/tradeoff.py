@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.job import DEFAULT_PRESET, job_from_words, workspace_from_words
+from pipeline.config.request import DEFAULT_PRESET, parse_request
+from pipeline.job import open_job
 from pipeline.studies.design import Point, label_of, singles, words_of
 from pipeline.studies.explore import (
     DEFAULT_BUDGET,
@@ -153,10 +154,10 @@ def tradeoff(subject: str, words: Mapping[str, str]) -> Path:
     Raises:
         UserError: a word is wrong, or the base itself failed.
     """
-    workspace, start = workspace_from_words(words), time.monotonic()
+    workspace, start = parse_request(words).workspace, time.monotonic()
     budget, own = seconds_of(words.get("budget", DEFAULT_BUDGET)), base_words(subject, words)
     knobs, folder = (
-        knobs_of(job_from_words(subject, own).settings),
+        knobs_of(open_job(subject, parse_request(own, subject)).settings),
         study_folder(workspace, "tradeoff", subject),
     )
     judge = Judging(words)
@@ -188,7 +189,7 @@ class Judging:
         from pipeline.studies.measured import clip_of  # torch, which the DAG does without
 
         if self._clip is None:
-            self._clip = clip_of(base, self.words, workspace_from_words(self.words))
+            self._clip = clip_of(base, self.words, parse_request(self.words).workspace)
         return self._clip
 
     def qualities(self, outcome: Outcome) -> dict[str, float]:
@@ -198,7 +199,7 @@ class Judging:
         from pipeline.studies.measured import notes_of
 
         clip = self.clip(base)
-        notes = notes_of(workspace_from_words(self.words), outcome.subject)
+        notes = notes_of(parse_request(self.words).workspace, outcome.subject)
         return notes.once(quality_name(outcome, clip), lambda: quality(outcome, clip))
 
     def __call__(self, outcome: Outcome) -> float:
@@ -216,7 +217,7 @@ def gathered(
     outcomes = [one for one in explorer.endings.values() if isinstance(one, Outcome)]
     outcomes += [preset.outcome for preset in presets if preset.outcome]
     explorer.say(f"timing {len(outcomes)} avatars in motion")
-    notes = notes_of(workspace_from_words(words), explorer.subject)
+    notes = notes_of(parse_request(words).workspace, explorer.subject)
     fast = speeds(outcomes, judge.clip(outcomes[0]), notes)
     entries: list[Entry] = []
     for point, ending in explorer.endings.items():

@@ -53,7 +53,7 @@ class GateRecord:
         kept: body vertices that carry Gaussians.
         vertices: body vertices in all.
         scores: [V], how often each of them is in a captured frame.
-        tau: the line under which the gate takes them; 0 where it is open.
+        tau: the threshold of their score under which the gate takes them; 0 where it is open.
         why: the gate's own sentence.
         definition: what counted as seen; None where nothing was counted.
     """
@@ -104,12 +104,12 @@ def read_gate(train: Path) -> GateRecord:
     """
     remedy = "run the train stage again"
     table = read_table(train / "visibility.parquet", VISIBILITY, remedy)
-    line = read_json(train / "gate.json", remedy)
-    if not isinstance(line, dict) or not {"tau", "why", "definition"} <= set(line):
-        raise UserError(f"{train / 'gate.json'} does not say where the line is: {remedy}")
+    found = read_json(train / "gate.json", remedy)
+    if not isinstance(found, dict) or not {"tau", "why", "definition"} <= set(found):
+        raise UserError(f"{train / 'gate.json'} has no threshold: {remedy}")
     kept = table["kept"]
     return GateRecord(
-        int(kept.sum()), len(kept), table["captured"], float(line["tau"]), line["why"], line["definition"]
+        int(kept.sum()), len(kept), table["captured"], float(found["tau"]), found["why"], found["definition"]
     )
 
 

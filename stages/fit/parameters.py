@@ -1,4 +1,4 @@
-"""What is optimised, and the landmarks that it poses.
+"""The parameters that are optimised, and the landmarks that they pose.
 
 Only the landmarks are posed, not the mesh. Every landmark is a point with skinning weights: a joint is
 a point that moves rigidly with it, and a point on the surface mixes rest position and weights of its

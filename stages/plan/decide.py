@@ -138,9 +138,9 @@ def face_loss(inputs: PlanInputs, made: Mapping[str, Decision]) -> Decision:
 
 def gate(scores: np.ndarray) -> Decision:
     """Whether the scores of the fitted body call for the visibility gate."""
-    line = evidence_threshold(scores)
-    cut = line.cut if line.closed else 0.0
-    return Decision("visibility_gate", line.closed, cut, LEAST_CUT, "of the body's vertices", line.why)
+    found = evidence_threshold(scores)
+    cut = found.cut if found.closed else 0.0
+    return Decision("visibility_gate", found.closed, cut, LEAST_CUT, "of the body's vertices", found.why)
 
 
 def azimuths(inputs: PlanInputs) -> Decision:

@@ -35,7 +35,7 @@ class Checkpoint:
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Puts a checkpoint in place of the one before, whole or not at all."""
+    """Replaces the last checkpoint by a new one, atomically."""
     header = {"iteration": checkpoint.iteration, "key": checkpoint.key, "extra": checkpoint.extra}
     header["sha256"] = digest_of(header, checkpoint.tensors)
     partial = folder / f"{NAME}.partial"
@@ -97,7 +97,7 @@ def gather(modules: dict[str, nn.Module], optimizers: Iterable[torch.optim.Optim
 def restore(
     tensors: dict[str, Tensor], modules: dict[str, nn.Module], optimizers: Iterable[torch.optim.Optimizer]
 ) -> None:
-    """Puts back what ``gather`` took, wherever the modules are now."""
+    """Restores what ``gather`` took, on whatever device the modules are now."""
     for prefix, module in modules.items():
         own = {
             name.removeprefix(f"{prefix}."): tensor

@@ -1,4 +1,4 @@
-"""The training frames: what the losses compare a rendering with."""
+"""The training frames, which the losses compare renderings with."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Frames:
         box: Box | None = None,
         generated: frozenset[int] = frozenset(),
     ):
-        """Reads nothing yet.
+        """A reader of crops; reads no file yet.
 
         Args:
             folder: what ingest published.

@@ -1,4 +1,4 @@
-"""Training that makes the avatar worse, though every number in it is finite.
+"""A check for training that makes the avatar worse, though every number in it is finite.
 
 With learning rates a hundred times too high nothing overflows: GroupNorm and sigmoids bound what the heads
 say, and Adam bounds the steps. What comes out is a ruin all the same, and must not be published as an avatar.
@@ -16,7 +16,7 @@ WATCHED = 3  # training frames that are looked at where none is held out
 
 
 def require_progress(untrained: float, now: float, iteration: int, settings: TrainSettings) -> None:
-    """Refuses to go on with an avatar that shows the clip much worse than the fitted body in first colours.
+    """Refuses to go on with an avatar much worse than the fitted body in its initial colours.
 
     Args:
         untrained, now: PSNR of the same frames, dB.

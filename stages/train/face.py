@@ -49,12 +49,12 @@ def face_loss(pasted: Pasted, color: Tensor, alpha: Tensor) -> Tensor:
 
 
 def face_triangles(canonical: Canonical) -> Tensor:
-    """[F] bool: triangles whose three corners lie on the face."""
+    """True for triangles whose three corners lie on the face, [F] bool."""
     return canonical.is_part("face")[canonical.faces].all(1)
 
 
 def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, texture: Tensor) -> Pasted:
-    """What a camera sees of some triangles of a mesh.
+    """The pixels that chosen triangles of a mesh cover in a camera's picture, with their colours.
 
     Which triangle a pixel sees is found without gradient, on the CPU wherever the mesh is; the place on it
     is differentiable, so that gradients are those of the texture sliding under the pixel. The outline's
@@ -79,13 +79,13 @@ def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, textu
 
 
 def _facing(camera: Camera, vertices: Tensor, faces: Tensor) -> Tensor:
-    """[F] bool: triangles that show the camera their outside."""
+    """True for triangles that show the camera their outside, [F] bool."""
     in_camera = to_camera(camera, vertices)
     return (face_normals(in_camera, faces) * in_camera[faces[:, 0]]).sum(1) < 0
 
 
 def _barycentrics(corners: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Where the pixels' rays meet their triangles, perspective-correct.
+    """The points where pixels' rays meet their triangles, perspective-correct.
 
     Args:
         corners: [P, 3, 3], each corner's place in the picture, pixels, and depth, metres.

@@ -22,10 +22,10 @@ MARK = "auxiliary.json"  # the stage publishes nothing where it is switched off
 
 
 class GeneratedFrames(Frames):
-    """Whole generated frames, each with its trust."""
+    """Whole generated frames, each with a trust map."""
 
     def __getitem__(self, frame: int) -> View:
-        """Frame number ``frame``, as it is."""
+        """The uncropped frame number ``frame``."""
         trust = torch.from_numpy(read_mask(self.folder / "trust", frame)).float() / 255
         return dataclasses.replace(super().__getitem__(frame), trust=trust)
 
@@ -40,7 +40,7 @@ class BothFrames(Frames):
     """
 
     def __init__(self, captured: Frames, made: Frames):
-        """Reads nothing yet."""
+        """Both sources under one set of numbers; reads no file yet."""
         self.captured, self.made = captured, made
         self.generated = made.generated
         self.cameras = {**captured.cameras, **made.cameras}
@@ -59,7 +59,7 @@ class BothFrames(Frames):
 
 @dataclasses.dataclass(frozen=True)
 class Generated:
-    """What the auxiliary stage published.
+    """The auxiliary stage's published frames.
 
     Attributes:
         views: the frames.
@@ -71,12 +71,12 @@ class Generated:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Their numbers."""
+        """The generated frames' numbers."""
         return self.poses.frames
 
 
 def read_generated(folder: Path | None, captured: Poses) -> Generated | None:
-    """Read the auxiliary stage's frames; None where there are none.
+    """Reads the auxiliary stage's frames; None where there are none.
 
     Raises:
         UserError: they do not go together with the clip's poses.
@@ -96,7 +96,7 @@ def read_generated(folder: Path | None, captured: Poses) -> Generated | None:
 
 
 def joined(captured: Poses, made: Poses) -> Poses:
-    """The poses of both, captured ones first."""
+    """The poses of captured and generated frames, captured ones first."""
     return Poses(
         (*captured.frames, *made.frames),
         rotation=torch.cat([captured.rotation, made.rotation]),

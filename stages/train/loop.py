@@ -16,10 +16,10 @@ from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import Frames
-from stages.train.gate import Gate
 from stages.train.objective import Evidence, Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
+from stages.train.visibility_gate import VisibilityGate
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
@@ -44,7 +44,7 @@ class Trainer:
         evidence: Evidence,
         settings: TrainSettings,
         network: Lpips | None = None,
-        gate: Gate | None = None,
+        gate: VisibilityGate | None = None,
     ):
         """Starts at iteration 0.
 
@@ -58,7 +58,7 @@ class Trainer:
         """
         self.avatar, self.poses, self.settings, self.gate = avatar, poses, settings, gate
         self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
-        self.objective.watch = None if gate is None else gate.watch
+        self.objective.on_frame = None if gate is None else gate.count
         self.curve, self.iteration = Curve(), 0
         self.untrained: float | None = None
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
@@ -123,7 +123,7 @@ class Trainer:
         return sum(values) / len(values)
 
     def checkpoint(self, key: str) -> Checkpoint:
-        """All of the state.
+        """A checkpoint with all of the state.
 
         Raises:
             NotFiniteError: any of it is not finite.
@@ -133,7 +133,7 @@ class Trainer:
         return Checkpoint(self.iteration, key, tensors, {**self.curve.state(), "untrained": self.untrained})
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Goes back to where ``checkpoint`` was taken."""
+        """Restores the state of a checkpoint."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
         self.avatar.apply_skin()
         self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
@@ -141,7 +141,7 @@ class Trainer:
         self._update_phase()
 
     def require_finite(self) -> None:
-        """Refuses to go on with a parameter that is not finite, however it came to be so.
+        """Refuses to go on with a parameter that is not finite.
 
         Raises:
             NotFiniteError: naming the parameter and the iteration.
@@ -154,7 +154,7 @@ class Trainer:
         require_finite(state, "training", f"after iteration {self.iteration}", self._remedy)
 
     def _require_finite_gradients(self) -> None:
-        """A loss that is finite may have a slope that is not, and Adam would spread it over all weights."""
+        """Refuses gradients that are not finite: a finite loss may have them, and Adam would spread them."""
         found = [(name, weight.grad) for name, weight in self._parameters if weight.grad is not None]
         if not finite(gradient for _, gradient in found):
             named = {f"the gradient of {name}": gradient for name, gradient in found}
@@ -162,7 +162,7 @@ class Trainer:
 
     @property
     def _where(self) -> str:
-        """Where in the run the present step is, for messages."""
+        """The present iteration and frames in words, for messages."""
         batch = self.settings.batch
         frames = [self.objective.draw(self.iteration * batch + place).frame for place in range(batch)]
         numbers = ", ".join(map(str, frames))
@@ -177,7 +177,8 @@ class Trainer:
 
     def _modules(self) -> dict[str, torch.nn.Module]:
         modules: dict[str, torch.nn.Module] = {
-            "avatar": self.avatar, "poses": self.poses, "sight": self.objective.sight,
+            "avatar": self.avatar, "poses": self.poses,
+            "visibility_cache": self.objective.visibility_cache,
         }  # fmt: skip
         return modules if self.gate is None else {**modules, "gate": self.gate}
 
@@ -221,7 +222,7 @@ def describe(values: dict[str, float]) -> str:
 
 
 def point_values(trainer: Trainer, psnr_db: float | None) -> dict[str, float]:
-    """What a point of the curve holds besides the loss terms."""
+    """The values of a point of the curve besides the loss terms."""
     values = {
         "gaussians": float(len(trainer.avatar.surface(trainer.level).canonical)),
         "learning_rate": trainer.settings.learning_rate

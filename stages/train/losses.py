@@ -40,7 +40,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
-    """What ``ssim`` computes, in plain torch: [H, W, 3] twice -> scalar.
+    """The same as ``ssim`` in plain torch: [H, W, 3] twice -> scalar.
 
     The five local moments are one grouped convolution with a single batch entry: the same as a
     batch of single-channel images takes twenty times as long on a CPU.
@@ -71,11 +71,12 @@ def over(color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
     return color + (1 - alpha)[..., None] * background
 
 
-def believed(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """The image moved towards the target where the target is in doubt, [H, W, 3].
+def blend_to_target(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """The image blended with its target: image where the weight is 1, target where it is 0, [H, W, 3].
 
-    Compared with the target, its L1 is the weighted L1, and SSIM and LPIPS see agreement where there
-    is nothing to be believed. No gradient reaches the image where the weight is 0.
+    For targets that are not to be trusted everywhere. Compared with the target, the result's L1 is the
+    weighted L1, and SSIM and LPIPS find no difference where the weight is 0; no gradient reaches the image
+    there.
 
     Args:
         image, target: [H, W, 3].
@@ -96,22 +97,22 @@ def laplacian(values: Tensor, neighbours: SparsePair, weight: Tensor | float = 1
     return (weight * (values - neighbours @ values).square()).mean()
 
 
-def size(values: Tensor, weight: Tensor | float = 1.0) -> Tensor:
-    """Mean square of per-vertex values, [N, C] -> scalar, each weighted by [N, 1] or a number."""
+def l2(values: Tensor, weight: Tensor | float = 1.0) -> Tensor:
+    """Mean square of per-vertex values, [N, C] -> scalar; each vertex weighted by [N, 1] or a number."""
     return (weight * values.square()).mean()
 
 
-def growth(log_scale: Tensor) -> Tensor:
-    """Mean square of what scales have grown beyond their initial values, [N, 3] logarithms -> scalar.
+def scale_growth(log_scale: Tensor) -> Tensor:
+    """Mean square of the growth of scales beyond their initial values, [N, 3] logarithms -> scalar.
 
-    Shrinking costs nothing here and gains nothing: a penalty on the size itself draws in what no
-    frame holds open, and leaves gaps in views that training never had.
+    Shrinking has no penalty: one on the scale itself shrinks Gaussians that no frame shows, and leaves gaps
+    in views that training never had.
     """
     return log_scale.clamp_min(0).square().mean()
 
 
-def outward(offset: Tensor, normals: Tensor, softness: float = 1e-3) -> Tensor:
-    """How far offsets point outwards, mean of ``max(n . offset / |offset|, 0)`` (ExAvatar's hands).
+def outward_offset(offset: Tensor, normals: Tensor, softness: float = 1e-3) -> Tensor:
+    """Mean of ``max(n . offset / |offset|, 0)``, the outward part of offsets' directions (ExAvatar's hands).
 
     Masks bleed around fingers; without it hands swell to fill them.
 
@@ -124,6 +125,6 @@ def outward(offset: Tensor, normals: Tensor, softness: float = 1e-3) -> Tensor:
     return (normals * direction).sum(1).clamp_min(0).mean()
 
 
-def spread_of_color(colors: Tensor) -> Tensor:
-    """Mean squared difference of colours from their mean, which gets no gradient: [M, 3] -> scalar."""
+def color_variance(colors: Tensor) -> Tensor:
+    """Mean squared difference of colours from their mean, [M, 3] -> scalar; the mean gets no gradient."""
     return (colors - colors.mean(0).detach()).square().mean()

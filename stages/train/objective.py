@@ -15,20 +15,20 @@ from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
 from stages.train.data import Frames, View
 from stages.train.face import face_loss, face_triangles, paste
+from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.perceptual import crop, due, perceptual
 from stages.train.poses import FramePose, PoseRefinement
 from stages.train.regularisers import Regularisers
 from stages.train.settings import TrainSettings
-from stages.train.sight import Sight
 
 Terms = dict[str, Tensor]
-Watch = Callable[[FramePose, View], None]
-"""Told of a drawn frame: the pose in which it was rendered, and the frame."""
+FrameHook = Callable[[FramePose, View], None]
+"""Called with the pose in which a frame was rendered, and the frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What an avatar is learnt from.
+    """The data that an avatar is learnt from.
 
     Attributes:
         views: crops of the training frames.
@@ -55,7 +55,7 @@ class Evidence:
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """The chance in one draw of a frame. Equal positions in a run draw equally.
+    """The random values of one draw of a frame. Equal positions in a run draw equally.
 
     Attributes:
         position: which draw of the run this is.
@@ -81,8 +81,8 @@ class Objective:
         avatar, poses: what is trained.
         evidence: what it is compared with.
         settings: the weights.
-        watch: told of every rendering, if there is one.
-        sight: what each frame saw when it was last drawn.
+        on_frame: called after each rendering, if there is one.
+        visibility_cache: which Gaussians each frame showed when it was last drawn.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Objective:
         settings: TrainSettings,
         network: Lpips | None = None,
     ):
-        """Reads nothing.
+        """The objective on the avatar's device; renders nothing yet.
 
         Args:
             avatar: what is trained; everything else goes where it is.
@@ -112,8 +112,9 @@ class Objective:
         self.avatar, self.poses, self.settings = avatar, poses, settings
         self.evidence, self.regularisers = moved(evidence, avatar.device), Regularisers(settings)
         self.network = None if network is None else network.to(avatar.device)
-        self.watch: Watch | None = None
-        self.sight = Sight(evidence.frames, len(avatar.surfaces[-1].canonical)).to(avatar.device)
+        self.on_frame: FrameHook | None = None
+        count = len(avatar.surfaces[-1].canonical)
+        self.visibility_cache = FrameVisibilityCache(evidence.frames, count).to(avatar.device)
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
         """The weighted terms, averaged over the frames of the step.
@@ -152,9 +153,9 @@ class Objective:
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
         posed = self._pose(decoded, pose, draw, level)
         rendering = render(posed.gaussians, view.camera)
-        self.sight.note(draw.frame, level, rendering.weights, decoded.surface.rows)
-        if self.watch is not None:
-            self.watch(pose, view)
+        self.visibility_cache.record(draw.frame, level, rendering.weights, decoded.surface.rows)
+        if self.on_frame is not None:
+            self.on_frame(pose, view)
         terms = {**self._photometric(rendering, view, draw), **self.regularisers.posed(decoded, posed)}
         if settings.face and not view.generated:
             terms["face"] = settings.face * self._face_term(decoded, posed, view)
@@ -165,17 +166,18 @@ class Objective:
     def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw, level: int) -> Posed:
         surface, rows = decoded.surface, None
         if self.settings.pose_seen_only:
-            rows = self.sight.rows(draw.frame, level, len(surface.canonical), surface.rows)
+            count = len(surface.canonical)
+            rows = self.visibility_cache.visible_rows(draw.frame, level, count, surface.rows)
         given = pose.rotation, pose.expression, pose.transl
         return self.avatar.pose(decoded, *given, draw.noise, draw.time, rows)
 
     def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
-        """How the rendering differs from the frame, both over the drawn background."""
+        """L1, SSIM and LPIPS between rendering and frame, both over the drawn background."""
         settings = self.settings
         image = losses.over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
         if view.trust is not None:
-            image = losses.believed(image, target, view.trust)
+            image = losses.blend_to_target(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
         terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}

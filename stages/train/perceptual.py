@@ -1,4 +1,4 @@
-"""LPIPS as a loss at a price that a CPU can pay: now and then, on a crop of the person."""
+"""LPIPS as a loss term: on a crop of the person, in one of several drawn frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PERSON = 0.5  # alpha from which a pixel is the person's
 
 
 def due(position: int, every: int) -> bool:
-    """Whether the ``position``-th drawn frame of a run is one that LPIPS looks at."""
+    """True where LPIPS takes part in the ``position``-th draw of a run."""
     return position % every == 0
 
 

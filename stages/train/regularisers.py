@@ -66,21 +66,22 @@ class Regularisers:
         self._last: tuple[Surface, PartWeights] | None = None
 
     def static(self, decoded: Decoded) -> Terms:
-        """What does not hang on the pose."""
+        """The terms that do not depend on the pose."""
         settings, weights, offset = self.settings, self._of(decoded.surface), decoded.offset
         terms = {
             "laplacian_offset": losses.laplacian(
                 offset, decoded.surface.neighbours, weights.laplacian_offset
             ),
-            "offset": losses.size(offset, weights.offset),
+            "offset": losses.l2(offset, weights.offset),
         }
         if settings.hand_normal and bool(weights.hands.any()):
             normals = decoded.surface.canonical.frames[weights.hands, :, 2]
-            terms["hand_normal"] = settings.hand_normal * losses.outward(offset[weights.hands], normals)
+            outward = losses.outward_offset(offset[weights.hands], normals)
+            terms["hand_normal"] = settings.hand_normal * outward
         return terms
 
     def posed(self, decoded: Decoded, posed: Posed) -> Terms:
-        """What one frame shows."""
+        """The terms of one posed frame."""
         settings, weights = self.settings, self._of(decoded.surface)
         neighbours, colors = decoded.surface.neighbours, posed.gaussians.colors
         same = 1.0 if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
@@ -94,26 +95,26 @@ class Regularisers:
             moved = decoded.offset + posed.pose_offset
             weight = same * weights.laplacian_offset
             terms["laplacian_pose_offset"] = losses.laplacian(moved, neighbours, weight)
-            terms["pose_offset"] = settings.pose_offset * losses.size(posed.pose_offset)
+            terms["pose_offset"] = settings.pose_offset * losses.l2(posed.pose_offset)
         if posed.color_residual is not None:
-            terms["residual_size"] = settings.residual_size * losses.size(posed.color_residual)
+            terms["residual_size"] = settings.residual_size * losses.l2(posed.color_residual)
         return terms
 
     def _scale_terms(self, posed: Posed, weights: PartWeights) -> Terms:
         settings, terms = self.settings, {}
         if settings.scale_size or settings.scale_size_hands:
-            terms["scale_size"] = losses.size(posed.gaussians.scales, weights.scale_size)
+            terms["scale_size"] = losses.l2(posed.gaussians.scales, weights.scale_size)
         if settings.scale_growth:
-            terms["scale_growth"] = settings.scale_growth * losses.growth(posed.log_scale)
+            terms["scale_growth"] = settings.scale_growth * losses.scale_growth(posed.log_scale)
         return terms
 
     def _color_terms(self, colors: Tensor, weights: PartWeights) -> Terms:
         settings, terms = self.settings, {}
         if settings.hand_color and bool(weights.hands.any()):
-            terms["hand_color"] = settings.hand_color * losses.spread_of_color(colors[weights.hands])
+            terms["hand_color"] = settings.hand_color * losses.color_variance(colors[weights.hands])
         if weights.undersides is not None:
             below, above = colors[weights.undersides.rows], weights.undersides.above @ colors.detach()
-            terms["arm_color"] = settings.arm_color * losses.size(below - above)
+            terms["arm_color"] = settings.arm_color * losses.l2(below - above)
         return terms
 
     def _of(self, surface: Surface) -> PartWeights:
@@ -123,7 +124,7 @@ class Regularisers:
 
 
 def unmixed(rows: Tensor, neighbours: SparsePair, count: int) -> Tensor:
-    """Where smoothness can be told: 1 where a vertex and all its neighbours are of one kind, else 0.
+    """The weight of smoothness terms: 1 where a vertex and all its neighbours are of one kind, else 0.
 
     The pose heads are asked for some vertices only. At the border of these, what is posed lies beside what
     is not, and a difference between the two says nothing of how smooth either is.

@@ -1,4 +1,4 @@
-"""Running the train stage."""
+"""The run of the train stage: reads the inputs, trains, publishes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
+from pipeline.avatar.canonical import dilate
 from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
 from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.device import moved, resolve
@@ -23,24 +24,24 @@ from pipeline.records import Split, read_cameras, read_footage, read_split, spre
 from pipeline.settings import as_dict
 from pipeline.stage import Context
 from pipeline.threads import threads
+from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
-from stages.train.clock import Clock
 from stages.train.data import Frames
 from stages.train.divergence import WATCHED, require_progress
-from stages.train.gate import Gate, write_ungated
 from stages.train.generated import BothFrames, Generated, joined, read_generated
+from stages.train.initial_colors import color_unseen, initial_color_logits
 from stages.train.loop import Trainer, describe, point_values
-from stages.train.obey import obey
 from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
 from stages.train.score_picture import score_picture
 from stages.train.settings import TrainSettings
-from stages.train.visibility import ever_in_frame, fill_unseen, first_colors, with_surroundings
+from stages.train.timer import TrainingTimer
+from stages.train.visibility_gate import VisibilityGate, ever_in_frame, write_ungated
 
 
 @dataclasses.dataclass(frozen=True)
 class Inputs:
-    """What the stage reads.
+    """The inputs of the stage.
 
     Attributes:
         body, identity, poses: the fitted person.
@@ -97,7 +98,7 @@ def run(context: Context) -> None:
 def train_subject(context: Context, compiled: CompileTimer) -> None:
     """Reads the inputs, trains what the plan calls for, and writes what is published."""
     inputs = read_inputs(context)
-    settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
+    settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
     device = resolve(settings.device)
     context.log(f"computes on {device}")
     context.timing("device", str(device))
@@ -105,7 +106,7 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     started = time.monotonic()
     avatar, texture = prepare(inputs, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
-    gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
+    gate = VisibilityGate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
     trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network, gate)
     context.timing("prepare_seconds", time.monotonic() - started)
     train(trainer, inputs, context, compiled)
@@ -114,11 +115,11 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
 
 
 def publish(trainer: Trainer, inputs: Inputs, context: Context) -> None:
-    """Writes the finished avatar and what is known of its making."""
+    """Writes the finished avatar, its poses, curve and visibility."""
     avatar, output, body = trainer.avatar, context.output, inputs.body
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
-        fill_unseen(avatar)
+        color_unseen(avatar)
     save_avatar(output / "avatar.safetensors", avatar)
     write_poses(output / "poses.parquet", trainer.poses.refined(inputs.poses.frames))
     trainer.curve.write(output / "curve.parquet")
@@ -155,7 +156,7 @@ def read_inputs(context: Context) -> Inputs:
 def prepare(
     inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context
 ) -> tuple[Avatar, Tensor | None]:
-    """The untrained avatar, where the poses are: what to keep of the body, and its first colours.
+    """The untrained avatar on the poses' device: the vertices to keep of the body, in their initial colours.
 
     Returns:
         The avatar, and the texture of the face loss, [N, 3]; None where it has no weight.
@@ -172,7 +173,7 @@ def prepare(
     if settings.initial_color or settings.face:
         chosen = spread(inputs.split.train, settings.color_frames)
         made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
-        logits = first_colors(avatar.eval(), refinement, inputs.views, chosen, made)
+        logits = initial_color_logits(avatar.eval(), refinement, inputs.views, chosen, made)
         texture = torch.sigmoid(logits) if settings.face else None
         if settings.initial_color:
             avatar.base_color.copy_(logits)
@@ -199,7 +200,8 @@ def keep(inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, co
         raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
     if not (settings.gate and settings.early_gate):
         return torch.ones(len(seen), dtype=torch.bool)
-    return with_surroundings(body, seen, settings.gate_rings).cpu()
+    # The rings are what offsets and refined poses may bring in.
+    return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
 
 
 def set_time_range(avatar: Avatar, inputs: Inputs) -> None:
@@ -224,10 +226,10 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
     shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
-    clock, first = Clock(context.work, trainer.iteration, compiled), trainer.iteration
+    timer, first = TrainingTimer(context.work, trainer.iteration, compiled), trainer.iteration
     watched = shown or spread(inputs.split.train, WATCHED)
     if trainer.untrained is None:
-        with clock.aside():
+        with timer.paused():
             trainer.untrained = trainer.held_out(inputs.whole, watched)
     with context.progress(settings.iterations, "training") as progress:
         progress.advance(trainer.iteration)
@@ -235,9 +237,9 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
             values = trainer.step()
             last = trainer.iteration == settings.iterations
             if last or trainer.iteration % settings.held_out_every == 0:
-                clock.mark(trainer.iteration)
+                timer.mark(trainer.iteration)
                 trainer.require_finite()
-                with clock.aside():
+                with timer.paused():
                     now = trainer.held_out(inputs.whole, watched)
                 require_progress(trainer.untrained, now, trainer.iteration, settings)
                 held_out = now if shown else None
@@ -245,26 +247,26 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
                 report(trainer.iteration, values, held_out, context)
             if not last and trainer.iteration % settings.checkpoint_every == 0:
                 write_checkpoint(context.work, trainer.checkpoint(key))
-                clock.save(trainer.iteration)
+                timer.save(trainer.iteration)
             progress.advance(1, describe(values))
-    note_time(clock, first, trainer.iteration, context)
+    record_time(timer, first, trainer.iteration, context)
 
 
-def note_time(clock: Clock, first: int, last: int, context: Context) -> None:
-    """What the iterations took, for run.json: all of them, and each of this process's.
+def record_time(timer: TrainingTimer, first: int, last: int, context: Context) -> None:
+    """Writes the seconds that the iterations took to run.json: of all, and for each of this process's.
 
     ``curve_seconds`` has iteration, wall-clock and processor seconds of each point of the curve.
     """
-    _, wall, _ = clock.now(last)
+    _, wall, _ = timer.now(last)
     context.timing("train_seconds", wall)
-    context.timing("milliseconds_an_iteration", 1e3 * (wall - clock.earlier[1]) / max(1, last - first))
-    context.timing("curve_seconds", clock.marks)
-    context.timing("earlier_seconds", clock.earlier[1])
-    context.timing("earlier_cpu_seconds", clock.earlier[2])
+    context.timing("milliseconds_an_iteration", 1e3 * (wall - timer.earlier[1]) / max(1, last - first))
+    context.timing("curve_seconds", timer.marks)
+    context.timing("earlier_seconds", timer.earlier[1])
+    context.timing("earlier_cpu_seconds", timer.earlier[2])
 
 
 def resume(trainer: Trainer, work: Path, key: str, context: Context) -> None:
-    """Goes on from the last checkpoint of this very run, if there is one."""
+    """Restores the last checkpoint of this very run, if there is one."""
     checkpoint = read_checkpoint(work, key)
     if checkpoint is not None:
         trainer.resume(checkpoint)
@@ -274,7 +276,7 @@ def resume(trainer: Trainer, work: Path, key: str, context: Context) -> None:
 
 
 def report(iteration: int, values: dict[str, float], held_out: float | None, context: Context) -> None:
-    """One line about how training goes."""
+    """Logs the loss terms, and the held-out PSNR where there is one."""
     note = "" if held_out is None else f", held-out PSNR {held_out:.2f} dB"
     context.log(f"iteration {iteration}: {describe(values)}{note}")
 

@@ -19,7 +19,7 @@ FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP, SOURCE = 1, 2, 3, 4, 5, 6  # purpose
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
-    """What learning rates are multiplied with: a short linear rise, then a cosine."""
+    """The factor of the learning rates: a short linear rise, then a cosine."""
     done = iteration / settings.iterations
     cosine = 0.5 * (1 + math.cos(math.pi * done))
     warm = min(1.0, (iteration + 1) / max(1, settings.warm_up))
@@ -27,12 +27,12 @@ def rate_factor(settings: TrainSettings, iteration: int) -> float:
 
 
 def reached(settings: TrainSettings, fraction: float, iteration: int) -> bool:
-    """Whether the run has come as far as ``fraction``."""
+    """True once ``fraction`` of the run is done."""
     return iteration >= fraction * settings.iterations
 
 
 def begun(settings: TrainSettings, fraction: float, iteration: int) -> bool:
-    """Whether something that starts at ``fraction`` of the run takes part; 1 stands for never."""
+    """True where something that starts at ``fraction`` of the run takes part; 1 stands for never."""
     return fraction < 1 and reached(settings, fraction, iteration)
 
 

@@ -9,8 +9,9 @@ import time
 import pytest
 
 from pipeline.artifact import Store
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import job_from_words
+from pipeline.job import open_job
 from pipeline.studies.explore import seconds_of
 from pipeline.studies.knobs import CHANCE, knobs_of
 from pipeline.studies.notes import Notes
@@ -115,7 +116,7 @@ def test_words_of_a_study_are_the_command_lines_on_top_of_its_scale(toy):
 @pytest.mark.parametrize("subject", ["smile", "mannequin_head"])
 @pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_every_level_of_every_knob_can_be_set_and_changes_something(subject, preset):
-    base = job_from_words(subject, {"preset": preset})
+    base = open_job(subject, parse_request({"preset": preset}, subject))
     knobs = knobs_of(base.settings)
     assert {"iterations", "number of Gaussians", "image size", "fit effort", "precision", "LPIPS"} <= {
         knob.name for knob in knobs
@@ -124,7 +125,7 @@ def test_every_level_of_every_knob_can_be_set_and_changes_something(subject, pre
     for knob in knobs:
         assert not knob.levels[0].words
         for level in knob.levels[1:]:
-            changed = job_from_words(subject, {"preset": preset, **level.words})
+            changed = open_job(subject, parse_request({"preset": preset, **level.words}, subject))
             assert changed.settings != base.settings, level.label
             assert level.factor > 0
 
@@ -134,7 +135,7 @@ def test_every_level_of_every_knob_can_be_set_and_changes_something(subject, pre
     [("smile", {"ingest.long_side": "256"}), ("mannequin_head", {"ingest.mannequin_size": "128"})],
 )
 def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
-    knobs = {knob.name: knob for knob in knobs_of(job_from_words(subject, {}).settings)}
+    knobs = {knob.name: knob for knob in knobs_of(open_job(subject, parse_request({}, subject)).settings)}
     assert knobs["image size"].levels[1].words == words  # long_side does nothing to what is filmed here
 
 
@@ -148,7 +149,7 @@ def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
     ],
 )
 def test_the_number_of_gaussians_is_turned_whatever_the_plan_says(words, own, others):
-    settings = job_from_words("smile", words).settings
+    settings = open_job("smile", parse_request(words, "smile")).settings
     levels = {knob.name: knob for knob in knobs_of(settings)}["number of Gaussians"].levels
     assert levels[0].label == own and not levels[0].words
     assert "".join(level.words["train.subdivisions"] for level in levels[1:]) == others

@@ -21,11 +21,11 @@ from pipeline.camera import facing_camera, project
 from pipeline.guard import finite
 from pipeline.metrics import composite, interior, psnr, ssim
 from pipeline.splat import Gaussians, render
-from pipeline.visibility import LARGEST_LOSS, cost, evidence_threshold, histogram, otsu
+from pipeline.visibility import LARGEST_LOSS, evidence_threshold, histogram, otsu_threshold, share_below
 from stages.fit import terms
-from stages.fit.doubt import exchanged, nonsense
 from stages.fit.initialise import continuous
 from stages.fit.observations import drop_guesses, visible
+from stages.fit.outlier_frames import isolated_outliers, left_right_swapped
 from stages.fit.parameters import orthonormalised
 from stages.fit.smoothing import nearest_branch, smooth
 from stages.fit.windows import bumps, windows
@@ -71,7 +71,7 @@ COUNT = st.integers(1, 12)
 RIGHT = 1e-4
 
 
-# Where the line is drawn
+# The gate's threshold
 
 
 @property_of(SCORES)
@@ -80,23 +80,24 @@ def a_histogram_counts_every_score(scores):
 
 
 @property_of(hnp.arrays(np.int64, 256, elements=st.integers(0, 10**9)).filter(lambda counts: counts.any()))
-def otsu_draws_within_the_range(counts):
-    tau, separability, low = otsu(counts)
+def otsu_threshold_lies_within_the_range(counts):
+    tau, separability, low = otsu_threshold(counts)
     assert 0 <= tau <= 1 and 0 <= separability <= 1 + 1e-9 and 0 <= low <= max(tau, 1e-12)
 
 
 @property_of(SCORES)
-def a_line_takes_no_more_than_it_may_and_never_everything(scores):
-    line = evidence_threshold(scores)
-    assert np.isfinite([line.tau, line.otsu, line.separability, line.low_mean, line.cut, line.lost]).all()
-    assert (scores >= line.tau).any()
-    if line.closed:
-        assert line.lost <= LARGEST_LOSS
+def a_threshold_takes_no_more_than_it_may_and_never_everything(scores):
+    found = evidence_threshold(scores)
+    values = (found.tau, found.otsu, found.separability, found.low_mean, found.cut, found.lost)
+    assert np.isfinite(values).all()
+    assert (scores >= found.tau).any()
+    if found.closed:
+        assert found.lost <= LARGEST_LOSS
 
 
 @property_of(SCORES, floats(0.0, 1.0))
-def a_higher_line_costs_more(scores, tau):
-    (cut, lost), (more_cut, more_lost) = cost(scores, tau / 2), cost(scores, tau)
+def a_higher_threshold_loses_more(scores, tau):
+    (cut, lost), (more_cut, more_lost) = share_below(scores, tau / 2), share_below(scores, tau)
     assert 0 <= cut <= more_cut <= 1 and 0 <= lost <= more_lost <= 1 + 1e-6
 
 
@@ -252,10 +253,10 @@ def regularisers_are_not_negative_and_have_finite_slopes(offset, log_scale):
     leaf, scale = tensor(offset).requires_grad_(), tensor(log_scale).requires_grad_()
     normals = torch.nn.functional.normalize(torch.ones(6, 3), dim=1)
     values = [
-        losses.size(leaf),
-        losses.growth(scale),
-        losses.outward(leaf, normals),
-        losses.spread_of_color(leaf),
+        losses.l2(leaf),
+        losses.scale_growth(scale),
+        losses.outward_offset(leaf, normals),
+        losses.color_variance(leaf),
     ]
     assert all(value.isfinite() and value >= 0 for value in values)
     sum(values).backward()
@@ -326,12 +327,12 @@ def guesses_are_only_taken_away(mask):
         )
     )
 )
-def doubt_never_takes_most_of_a_clip(clip):
+def outlier_frames_are_never_most_of_a_clip(clip):
     left, right, gaps = clip
     frames = np.cumsum(gaps).astype(np.int64)
-    rows = exchanged(frames, left, right)
+    rows = left_right_swapped(frames, left, right)
     assert len(rows) <= len(frames) / 2 and (np.diff(rows) > 0).all()
-    assert set(nonsense(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
+    assert set(isolated_outliers(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
 
 
 # Masks, splits and draws

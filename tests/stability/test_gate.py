@@ -1,4 +1,4 @@
-"""Otsu's line and the visibility gate: every shape of histogram, everything gated, flicker at the line."""
+"""Otsu's threshold and the visibility gate: all shapes of histogram, everything gated, flicker."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from pipeline.visibility import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
-    cost,
     evidence_threshold,
     fixed_threshold,
     histogram,
-    otsu,
+    otsu_threshold,
+    share_below,
 )
 from stages.train import run as stage
-from stages.train.gate import Gate
+from stages.train.visibility_gate import VisibilityGate
 from tests.stability.test_skinning import SMALL
 from tests.stages.test_train import trainer_for
 from tests.stages.train_subject import BODY_FILE, TINY, context_for, write_subject
@@ -49,34 +49,34 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_every_histogram_has_a_line_within_its_range(shape):
+def test_every_histogram_has_a_threshold_within_its_range(shape):
     scores = SHAPES[shape]
-    tau, separability, low = otsu(histogram(scores))
+    tau, separability, low = otsu_threshold(histogram(scores))
     assert 0 <= tau <= 1 and 0 <= separability <= 1 + 1e-9 and 0 <= low <= tau
-    for line in (evidence_threshold(scores), fixed_threshold(scores, 0.5)):
-        values = (line.tau, line.otsu, line.separability, line.low_mean, line.cut, line.lost)
-        assert np.isfinite(values).all() and line.why
-        assert 0 <= line.cut <= 1 and 0 <= line.lost <= 1
-    line = evidence_threshold(scores)
-    if line.closed:
-        assert line.lost <= LARGEST_LOSS and line.cut >= LEAST_CUT
-        assert (scores >= line.tau).any()  # something is left
+    for found in (evidence_threshold(scores), fixed_threshold(scores, 0.5)):
+        values = (found.tau, found.otsu, found.separability, found.low_mean, found.cut, found.lost)
+        assert np.isfinite(values).all() and found.why
+        assert 0 <= found.cut <= 1 and 0 <= found.lost <= 1
+    found = evidence_threshold(scores)
+    if found.closed:
+        assert found.lost <= LARGEST_LOSS and found.cut >= LEAST_CUT
+        assert (scores >= found.tau).any()  # something is left
 
 
-def test_a_line_never_gates_everything():
+def test_a_threshold_never_gates_everything():
     for scores in SHAPES.values():
         assert (scores >= evidence_threshold(scores).tau).any()
 
 
-def test_scores_that_differ_by_rounding_give_one_line():
+def test_scores_that_differ_by_rounding_give_one_threshold():
     """Counts divided by the number of looks: 1/3 is not exactly what 2/6 is in float32."""
     for looks in (3, 7, 500, 4999):
         hits = np.repeat([0, looks // 3, looks], [300, 5, 700])
-        lines = {
+        thresholds = {
             evidence_threshold(np.float64(np.float32(hits / looks))).tau,
             evidence_threshold(hits / looks).tau,
         }
-        assert len(lines) == 1
+        assert len(thresholds) == 1
 
 
 @pytest.mark.parametrize(
@@ -104,8 +104,8 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
     before = int(trainer.avatar.active.sum())
     trainer.gate.drawn[:] = 10
     trainer.gate.hits[:] = 9
-    line = trainer.gate.update()
-    assert not line.closed and "all of the body" in line.why
+    found = trainer.gate.update()
+    assert not found.closed and "all of the body" in found.why
     assert int(trainer.avatar.active.sum()) == before
     values = trainer.step()
     assert np.isfinite(list(values.values())).all()
@@ -138,8 +138,8 @@ def test_a_body_outside_every_picture_is_refused(subject, tmp_path):
     assert not list(context.output.iterdir())
 
 
-def test_flicker_at_the_line_keeps_training_finite_and_weights_in_place(subject, tmp_path):
-    """A hundred vertices cross the line at every look."""
+def test_flicker_at_the_threshold_keeps_training_finite_and_weights_in_place(subject, tmp_path):
+    """A hundred vertices cross the threshold at every look."""
     settings = {"gate_from": 1.0, "iterations": 12, "subdivisions": 1, "subdivide_from": 0.3}
     trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
     on = trainer.avatar.active.clone()
@@ -173,8 +173,8 @@ def test_flickering_gate_gives_the_same_run_twice(subject, tmp_path):
 def test_what_was_never_looked_at_has_a_score_of_zero():
     body = load_body(BODY_FILE)
     avatar = Avatar(body, mean_identity(body), torch.arange(50), SMALL)
-    gate = Gate(avatar, len(body.v_template), TINY)
+    gate = VisibilityGate(avatar, len(body.v_template), TINY)
     assert not gate.scores().any() and gate.scores().isfinite().all()
-    line = gate.update()
-    assert not line.closed and bool(avatar.active.all())
-    assert cost(np.zeros(5), 0.5) == (1.0, 0.0)
+    found = gate.update()
+    assert not found.closed and bool(avatar.active.all())
+    assert share_below(np.zeros(5), 0.5) == (1.0, 0.0)

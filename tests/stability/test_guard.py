@@ -13,9 +13,9 @@ from pipeline import guard
 from pipeline.artifact import Store
 from pipeline.body import Poses, write_poses
 from pipeline.errors import UserError
+from pipeline.explain import explain
 from pipeline.guard import NotFiniteError, finite, require_finite, require_finite_files
 from pipeline.records import write_json
-from pipeline.stage import explain
 from pipeline.tables import write_table
 from stages.evaluate.frame_metrics import Scorer
 

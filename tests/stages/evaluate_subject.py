@@ -21,8 +21,8 @@ from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.run import evaluate
 from stages.evaluate.settings import EvaluateSettings
-from stages.fit.residuals import SCHEMA as RESIDUALS
-from stages.train.gate import write_visibility
+from stages.fit.run import RESIDUALS_SCHEMA as RESIDUALS
+from stages.train.visibility_gate import write_visibility
 from tests.plans import plan_of
 
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept

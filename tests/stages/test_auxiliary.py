@@ -1,6 +1,5 @@
 """The auxiliary stage: guidance, the texture, the crop, folders of others, and when nothing is made."""
 
-import dataclasses
 import json
 import shutil
 
@@ -370,13 +369,3 @@ def test_what_cannot_be_read_is_named(full, tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"no video")
     with pytest.raises(UserError, match="cannot be read as a video"):
         read_folder(tmp_path / "v.mp4", clip, turn, BODY_FILE)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"generator": "magic"}, {"generator": "folder"}, {"generator": "mimicmotion"}, {"frames": 3},
-     {"overlap": 71}, {"motion": "dance"}, {"flicker": 0.0}, {"texture_levels": 3}],
-)  # fmt: skip
-def test_settings_that_cannot_work_are_refused(changes):
-    with pytest.raises(ValueError, match="auxiliary"):
-        dataclasses.replace(AuxiliarySettings(), **changes)

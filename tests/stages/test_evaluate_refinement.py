@@ -11,12 +11,11 @@ import pytest
 import torch
 from rich.console import Console
 
-from pipeline import protocols
 from pipeline.body import Pose, read_poses, write_poses
 from pipeline.camera import project
 from pipeline.frames import read_mask, write_mask
 from pipeline.keypoints import empty_keypoints, write_keypoints
-from pipeline.metrics import BACKGROUNDS, psnr
+from pipeline.metrics import psnr
 from pipeline.plan import write_plan
 from pipeline.protocols import PROTOCOLS
 from pipeline.records import read_cameras
@@ -268,7 +267,3 @@ def test_a_perfect_pose_is_left_alone(subject):
 
 def test_the_protocol_names_what_was_done():
     assert "refined" not in protocol_sentences(PROTOCOLS["ours"], NOT_REFINED)
-
-
-def test_the_setting_knows_every_background():
-    assert tuple(BACKGROUNDS) == protocols.BACKGROUNDS

@@ -25,9 +25,9 @@ from pipeline.keypoints import empty_keypoints
 from pipeline.pose_files import read_hand_mean, read_initial_poses, tool_joints, write_peer_files
 from pipeline.pose_files.coefficients import is_official_smplx
 from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initial_poses import initial_from_files
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model
-from stages.fit.pose_start import initial_from_files
 from stages.fit.registration import views_of
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
 

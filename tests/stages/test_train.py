@@ -17,10 +17,10 @@ from pipeline.splat import render
 from pipeline.tables import read_table
 from stages.train import losses
 from stages.train import run as stage
+from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
-from stages.train.gate import SCHEMA, Gate
 from stages.train.loop import Trainer
-from stages.train.obey import obey
+from stages.train.visibility_gate import SCHEMA, VisibilityGate
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
 
 PUBLISHED = {
@@ -46,10 +46,10 @@ def finished(subject):
 
 def trainer_for(context) -> Trainer:
     inputs = stage.read_inputs(context)
-    settings = obey(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
+    settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
     refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
     avatar, texture = stage.prepare(inputs, refinement, settings, context)
-    gate = Gate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
+    gate = VisibilityGate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
     return Trainer(avatar, refinement, inputs.evidence(texture), settings, gate=gate)
 
 
@@ -155,7 +155,7 @@ def test_training_comes_closer_to_the_training_frames(subject, tmp_path):
     assert trainer.held_out(inputs.whole, inputs.split.train) > before + 3
 
 
-def test_first_colors_are_near_the_truth(subject, tmp_path):
+def test_initial_colors_are_near_the_truth(subject, tmp_path):
     context = context_for(subject, tmp_path / "out")
     inputs, trainer = stage.read_inputs(context), trainer_for(context)
     grey = trainer_for(context_for(subject, tmp_path / "grey", initial_color=False))

@@ -9,7 +9,7 @@ from pipeline.body import Pose, load_body
 from pipeline.device import moved
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import gate, loop, losses, objective, visibility
+from stages.train import initial_colors, loop, losses, objective, visibility_gate
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
@@ -21,7 +21,7 @@ ALL_ON = {
     "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, loop, visibility)
+RENDERERS = (objective, loop, initial_colors)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    scored = gate.Gate(avatar, len(inputs.body.v_template), context.settings)
+    scored = visibility_gate.VisibilityGate(avatar, len(inputs.body.v_template), context.settings)
     evidence = inputs.evidence(texture)
     trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]

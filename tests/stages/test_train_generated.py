@@ -13,8 +13,8 @@ from pipeline.frames import write_frame, write_mask
 from pipeline.records import read_cameras, write_cameras, write_json
 from pipeline.tables import read_table
 from stages.train import run as stage
-from stages.train.gate import SCHEMA
 from stages.train.generated import BothFrames, read_generated
+from stages.train.visibility_gate import SCHEMA
 from tests.stages.train_subject import context_for, write_subject
 
 FIRST = 100_000
@@ -103,7 +103,7 @@ def test_what_is_not_trusted_costs_nothing(objective, monkeypatch):
     assert untrusted["ssim"].item() == pytest.approx(0, abs=1e-5)
 
 
-def test_first_colours_of_the_unseen_side_are_the_generated_ones(objective):
+def test_initial_colours_of_the_unseen_side_are_the_generated_ones(objective):
     with_them = objective.avatar
     back = with_them.surfaces[-1].canonical.frames[:, 2, 2] < -0.9
     colors = torch.sigmoid(with_them.base_color[back])

@@ -124,12 +124,12 @@ def test_lpips_of_every_kth_draw_has_k_times_the_weight(objective):
 def test_second_draw_of_a_frame_poses_what_the_first_one_showed(objective):
     made, whole = objective(face=0.0, pose_seen_only=True), objective(face=0.0, pose_seen_only=False)
     frame, count = made.draw(0).frame, len(made.avatar)
-    assert made.sight.rows(frame, 0, count) is None  # and so the first draw poses all
+    assert made.visibility_cache.visible_rows(frame, 0, count) is None  # and so the first draw poses all
     first, expected = (terms(0, 0, False) for terms in (made, whole))
     assert all(torch.equal(first[name], expected[name]) for name in expected)
-    rows = made.sight.rows(frame, 0, count)
+    rows = made.visibility_cache.visible_rows(frame, 0, count)
     assert 0 < len(rows) < count
-    assert made.sight.rows(frame, 1, count) is None  # another level has other Gaussians
+    assert made.visibility_cache.visible_rows(frame, 1, count) is None  # another level has other Gaussians
     again = made(0, 0, False)
     torch.testing.assert_close(again["l1"], expected["l1"], rtol=1e-3, atol=1e-6)
     assert 0 < again["pose_offset"] < expected["pose_offset"]  # hidden ones are not asked for
@@ -140,11 +140,11 @@ def test_what_was_left_out_by_mistake_is_posed_again_at_the_next_draw(objective)
     made = objective(pose_seen_only=True)
     frame, count = made.draw(0).frame, len(made.avatar)
     made(0, 0, False)
-    right = made.sight.rows(frame, 0, count)
-    made.sight.note(frame, 0, torch.zeros(count))
-    assert len(made.sight.rows(frame, 0, count)) == 0
+    right = made.visibility_cache.visible_rows(frame, 0, count)
+    made.visibility_cache.record(frame, 0, torch.zeros(count))
+    assert len(made.visibility_cache.visible_rows(frame, 0, count)) == 0
     assert all(bool(term.isfinite()) for term in made(0, 0, False).values())
-    found = made.sight.rows(frame, 0, count)
+    found = made.visibility_cache.visible_rows(frame, 0, count)
     assert len(set(found.tolist()) ^ set(right.tolist())) < 0.1 * len(right)
 
 

@@ -8,9 +8,8 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.residual import PLACES, REST, encode, part_rows
-from pipeline.body import PARTS, Pose, load_body, mean_identity
+from pipeline.body import Pose, load_body, mean_identity
 from pipeline.workspace import REPOSITORY
-from stages.train import settings as train_settings
 
 SMALL = Architecture(
     plane_resolution=8,
@@ -167,11 +166,6 @@ def test_saved_residuals_are_read_back(tmp_path, body, kept):
     assert again.architecture == avatar.architecture and again.residuals_active
     for time in (None, 3.0, 99.0):
         assert torch.equal(avatar.gaussians(a_pose(), time).colors, again.gaussians(a_pose(), time).colors)
-
-
-def test_settings_know_the_parts_and_places():
-    assert set(train_settings.PARTS) == {*PARTS, REST}
-    assert train_settings.PLACES == PLACES
 
 
 def test_positions_move_only_where_residuals_are_told_to_move_them(body, kept):

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pipeline.avatar.rows import put, take
+from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.regularisers import unmixed
-from stages.train.sight import Sight
 from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, body, one_thread  # noqa: F401
 from tests.unit.test_train_losses import PATH
 
@@ -40,18 +40,18 @@ def test_rows_that_are_asked_for_are_posed_as_ever_and_teach_as_ever(body, place
         assert (mine - theirs).norm() < 1e-3 * theirs.norm() + 1e-5
 
 
-def test_sight_remembers_each_frame_and_survives_a_checkpoint():
-    sight, weights = Sight((3, 8), 21), torch.zeros(21)
+def test_visibility_cache_remembers_each_frame_and_survives_a_checkpoint():
+    cache, weights = FrameVisibilityCache((3, 8), 21), torch.zeros(21)
     weights[[0, 7, 8, 20]] = torch.tensor([1.0, 1e-7, 0.0, 3.0])
-    assert sight.rows(3, 1, 21) is None
-    sight.note(3, 1, weights)
-    other = Sight((3, 8), 21)
-    other.load_state_dict(sight.state_dict())
-    for one in (sight, other):
-        assert one.rows(3, 1, 21).tolist() == [0, 7, 20]
-        assert one.rows(8, 1, 21) is None and one.rows(3, 0, 10) is None
-    sight.note(3, 0, weights[:10])
-    assert sight.rows(3, 0, 10).tolist() == [0, 7]
+    assert cache.visible_rows(3, 1, 21) is None
+    cache.record(3, 1, weights)
+    other = FrameVisibilityCache((3, 8), 21)
+    other.load_state_dict(cache.state_dict())
+    for one in (cache, other):
+        assert one.visible_rows(3, 1, 21).tolist() == [0, 7, 20]
+        assert one.visible_rows(8, 1, 21) is None and one.visible_rows(3, 0, 10) is None
+    cache.record(3, 0, weights[:10])
+    assert cache.visible_rows(3, 0, 10).tolist() == [0, 7]
 
 
 def test_smoothness_is_told_where_all_neighbours_are_of_one_kind():
@@ -61,9 +61,9 @@ def test_smoothness_is_told_where_all_neighbours_are_of_one_kind():
     assert unmixed(torch.tensor([], dtype=torch.long), PATH, 3).flatten().tolist() == [1, 1, 1]
 
 
-def test_sight_of_a_gated_surface_is_kept_over_the_whole_one():
-    sight, kept = Sight((3,), 20), torch.tensor([2, 5, 11, 19])
-    sight.note(3, 1, torch.tensor([1.0, 0.0, 2.0, 3.0]), kept)
-    assert sight.rows(3, 1, 4, kept).tolist() == [0, 2, 3]
-    assert sight.rows(3, 1, 20).tolist() == [2, 11, 19]  # the gate opened: what came back is unseen
-    assert sight.rows(3, 1, 2, torch.tensor([1, 11])).tolist() == [1]
+def test_visibility_cache_of_a_gated_surface_covers_the_whole_one():
+    cache, kept = FrameVisibilityCache((3,), 20), torch.tensor([2, 5, 11, 19])
+    cache.record(3, 1, torch.tensor([1.0, 0.0, 2.0, 3.0]), kept)
+    assert cache.visible_rows(3, 1, 4, kept).tolist() == [0, 2, 3]
+    assert cache.visible_rows(3, 1, 20).tolist() == [2, 11, 19]  # the gate opened: what came back is unseen
+    assert cache.visible_rows(3, 1, 2, torch.tensor([1, 11])).tolist() == [1]

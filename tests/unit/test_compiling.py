@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.study import _cpu_seconds
-from stages.train.clock import Clock
+from stages.train.timer import TrainingTimer
 
 
 def sums(values):
@@ -45,11 +45,11 @@ def test_a_study_does_not_charge_its_first_run_for_compiling():
     assert _cpu_seconds({"cpu_seconds": 50.0, "timings": {}}) == 50  # a version from before, or another stage
 
 
-def test_a_clock_leaves_out_what_was_compiled(tmp_path):
+def test_the_training_timer_leaves_out_what_was_compiled(tmp_path):
     compiled = CompileTimer()
-    clock = Clock(tmp_path, 0, compiled)
+    timer = TrainingTimer(tmp_path, 0, compiled)
     compiled.seconds, compiled.cpu_seconds = 50.0, 40.0  # on the way
-    assert clock.now(1)[1:] == pytest.approx((-50, -40), abs=5)
-    with clock.aside():
+    assert timer.now(1)[1:] == pytest.approx((-50, -40), abs=5)
+    with timer.paused():
         compiled.seconds, compiled.cpu_seconds = 150.0, 140.0  # while it was only looked at
-    assert clock.now(2)[1:] == pytest.approx((-50, -40), abs=5)
+    assert timer.now(2)[1:] == pytest.approx((-50, -40), abs=5)

@@ -12,9 +12,8 @@ from pipeline.avatar import Architecture, Avatar, heads
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import plain_normals, plain_place
 from pipeline.body import Pose, joint_transforms, load_body, mean_identity
-from pipeline.device import DEVICES, moved, resolve
+from pipeline.device import moved, resolve
 from pipeline.errors import UserError
-from stages.train import settings
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
@@ -41,12 +40,6 @@ def test_cuda_without_a_gpu_names_the_remedy(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match=r"train\.device=cpu"):
         resolve("cuda")
-
-
-def test_the_setting_knows_the_same_words():
-    assert settings.DEVICES == DEVICES
-    with pytest.raises(ValueError, match=r"train\.device"):
-        settings.TrainSettings(device="tpu")
 
 
 @dataclasses.dataclass(frozen=True)

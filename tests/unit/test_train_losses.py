@@ -113,46 +113,46 @@ def test_laplacian_weights_each_vertex():
     assert float(losses.laplacian(values, PATH, weight)) == pytest.approx((2 * 1 + 0.5 * 4) / 3)
 
 
-def test_size_by_hand():
+def test_l2_by_hand():
     values = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    assert float(losses.size(values)) == 7.5
-    assert float(losses.size(values, torch.tensor([[0.0], [2.0]]))) == 12.5
-    assert float(losses.size(values, 0.0)) == 0
+    assert float(losses.l2(values)) == 7.5
+    assert float(losses.l2(values, torch.tensor([[0.0], [2.0]]))) == 12.5
+    assert float(losses.l2(values, 0.0)) == 0
 
 
-def test_believed_image_has_the_weighted_l1_and_no_gradient_in_doubt():
+def test_blended_image_has_the_weighted_l1_and_no_gradient_at_weight_zero():
     image, target = drawn(12, 13, 3).requires_grad_(), drawn(12, 13, 3, seed=1)
     weight = torch.ones(12, 13)
     weight[3:5] = 0.0
     weight[7] = 0.25
-    value = losses.l1(losses.believed(image, target, weight), target)
+    value = losses.l1(losses.blend_to_target(image, target, weight), target)
     torch.testing.assert_close(value, (weight[..., None] * (image - target).abs()).mean())
-    (value + losses.ssim(losses.believed(image, target, weight), target)).backward()
+    (value + losses.ssim(losses.blend_to_target(image, target, weight), target)).backward()
     assert (image.grad[3:5] == 0).all() and (image.grad[7] != 0).any()
 
 
-def test_growth_costs_and_shrinking_does_not():
+def test_scale_growth_has_a_penalty_and_shrinking_has_none():
     log_scale = torch.tensor([[-2.0, -0.1, 0.0], [0.5, 1.0, -1.0]], requires_grad=True)
-    value = losses.growth(log_scale)
+    value = losses.scale_growth(log_scale)
     assert float(value.detach()) == pytest.approx((0.25 + 1) / 6)
     value.backward()
     assert torch.equal(log_scale.grad != 0, log_scale.detach() > 0)
 
 
-def test_outward_offsets_cost_by_their_direction():
+def test_outward_offsets_count_by_their_direction():
     normals = torch.tensor([[0.0, 0.0, 1.0]])
-    assert float(losses.outward(0.02 * normals, normals)) == pytest.approx(1, abs=0.01)
-    assert float(losses.outward(-0.02 * normals, normals)) == 0
+    assert float(losses.outward_offset(0.02 * normals, normals)) == pytest.approx(1, abs=0.01)
+    assert float(losses.outward_offset(-0.02 * normals, normals)) == 0
     aslant = torch.tensor([[0.0, 0.02, 0.02]])
-    assert float(losses.outward(aslant, normals)) == pytest.approx(2**-0.5, abs=0.01)
+    assert float(losses.outward_offset(aslant, normals)) == pytest.approx(2**-0.5, abs=0.01)
     nothing = torch.zeros(4, 3, requires_grad=True)
-    losses.outward(nothing, normals.expand(4, 3)).backward()
+    losses.outward_offset(nothing, normals.expand(4, 3)).backward()
     assert torch.isfinite(nothing.grad).all()
 
 
-def test_spread_of_colour_pulls_towards_a_mean_that_stays():
+def test_color_variance_pulls_towards_a_mean_that_stays():
     colors = torch.tensor([[0.0, 0.5, 1.0], [1.0, 0.5, 1.0]], requires_grad=True)
-    value = losses.spread_of_color(colors)
+    value = losses.color_variance(colors)
     assert float(value.detach()) == pytest.approx(2 * 0.25 / 6)
     value.backward()
     torch.testing.assert_close(colors.grad, (colors.detach() - colors.detach().mean(0)) * 2 / 6)

@@ -49,7 +49,7 @@ def _names(module: str, name: str) -> Any:
 
 
 def _reconstructed(kind: Any, base: Any, state: Any) -> Stub:
-    """What Python 2 makes objects with."""
+    """The constructor that Python 2's pickles name."""
     return kind() if isinstance(kind, type) and issubclass(kind, Stub) else _Unknown()
 
 

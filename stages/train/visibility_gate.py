@@ -1,16 +1,20 @@
-"""The visibility gate: what is seen too seldom takes no part in training (paper, Section 3.4).
+"""The visibility gate: vertices that are seen too seldom take no part in training (paper, Section 3.4).
 
 Each drawn frame shows the body vertices that lie in the crop around the person and in front of the camera.
 That is measured for gated vertices as for all others, by posing the bare body, which costs a millisecond.
 
 The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
-the first iteration on and never forgotten. After the warm-up, and regularly again, a line is drawn through
+the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
 the captured frames' scores (:mod:`pipeline.visibility`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
 that a region that comes into view later returns.
 
 The counters and the avatar's own mark of what is active are buffers; a checkpoint holds them, and a
 resumed run goes on exactly as one that was never stopped.
+
+A clip of a head says nothing about the feet. Where no training frame has a vertex in its picture, its score
+is zero whatever training does, and the gate would take it out after the warm-up; so it gets no Gaussian to
+begin with (``ever_in_frame``). That saves the warm-up's time, and the triplane is fitted to what is left.
 """
 
 from __future__ import annotations
@@ -25,11 +29,12 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.device import moved
 from pipeline.records import write_json
 from pipeline.tables import write_table
-from pipeline.visibility import Line, body_in_frame, evidence_threshold, fixed_threshold
-from stages.train.data import View
-from stages.train.poses import FramePose
+from pipeline.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
+from stages.train.data import Frames, View
+from stages.train.poses import FramePose, PoseRefinement
 from stages.train.settings import TrainSettings
 
 SCHEMA = pa.schema(
@@ -45,24 +50,24 @@ DEFINITION = "in_frame"  # what counts as seen, for gate.json
 CAPTURED, GENERATED = 0, 1
 
 
-class Gate(nn.Module):
-    """The scores of one run, and the line through them.
+class VisibilityGate(nn.Module):
+    """The visibility scores of one run, and the threshold found in them.
 
     Attributes:
         hits: [2, K] int64, how many drawn frames showed each of the avatar's body vertices; captured and
             generated frames.
         drawn: [2] int64, how many frames were drawn.
-        lined_hits, lined_drawn: the same when the last line was drawn, for a run that goes on from a
-            checkpoint after it.
+        hits_at_threshold, drawn_at_threshold: the same when the last threshold was found, for a run that
+            goes on from a checkpoint after it.
     """
 
     hits: Tensor  # [2, K]
     drawn: Tensor  # [2]
-    lined_hits: Tensor  # [2, K]
-    lined_drawn: Tensor  # [2]
+    hits_at_threshold: Tensor  # [2, K]
+    drawn_at_threshold: Tensor  # [2]
 
     def __init__(self, avatar: Avatar, vertices: int, settings: TrainSettings):
-        """Counts nothing yet.
+        """A gate that has counted no frame yet.
 
         Args:
             avatar: whose body vertices are counted.
@@ -72,19 +77,19 @@ class Gate(nn.Module):
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
         for name, shape in (("hits", (2, len(avatar.kept))), ("drawn", (2,))):
-            for prefix in ("", "lined_"):
+            for suffix in ("", "_at_threshold"):
                 counts = torch.zeros(shape, dtype=torch.long, device=avatar.device)
-                self.register_buffer(prefix + name, counts)
-        self._first = avatar.active.clone()  # what is trained while the gate stays open
+                self.register_buffer(name + suffix, counts)
+        self._active_at_start = avatar.active.clone()  # what is trained while the gate stays open
 
     @property
     def avatar(self) -> Avatar:
-        """Kept in a tuple, so that its weights are not taken for this module's."""
+        """The gated avatar; kept in a tuple, so that its weights are not taken for this module's."""
         return self._avatar[0]
 
     @torch.no_grad()
-    def watch(self, pose: FramePose, view: View) -> None:
-        """Counts what one drawn frame shows.
+    def count(self, pose: FramePose, view: View) -> None:
+        """Counts one drawn frame and the vertices in its picture.
 
         Args:
             pose: in which it was rendered.
@@ -99,51 +104,49 @@ class Gate(nn.Module):
         return self.hits / self.drawn.clamp_min(1)[:, None]
 
     def whole_body(self, values: Tensor) -> np.ndarray:
-        """What is known of the avatar's vertices, [K], over the whole body, [V] float64; else 0."""
+        """Values of the avatar's vertices, [K], spread over the whole body, [V] float64; elsewhere 0."""
         whole = torch.zeros(self._vertices, dtype=torch.float64)
         whole[self.avatar.kept] = values.double().cpu()
         return whole.numpy()
 
     def due(self, iteration: int) -> bool:
-        """Whether a line is drawn after that many iterations."""
+        """True where a threshold is to be found after that many iterations."""
         settings = self._settings
         first = round(settings.gate_from * settings.iterations)
         return iteration >= max(1, first) and (iteration - first) % settings.gate_every == 0
 
     @property
-    def line(self) -> Line | None:
-        """The last line that was drawn; None before the warm-up has ended."""
-        return self._drawn()[0] if bool(self.lined_drawn.any()) else None
+    def threshold(self) -> Threshold | None:
+        """The last threshold that was found; None before the warm-up has ended."""
+        return self._last_threshold()[0] if bool(self.drawn_at_threshold.any()) else None
 
-    def update(self) -> Line:
-        """Draws the line and gates what lies below it."""
-        self.lined_hits.copy_(self.hits)
-        self.lined_drawn.copy_(self.drawn)
-        line, active = self._drawn()
+    def update(self) -> Threshold:
+        """Finds the threshold and gates what lies below it."""
+        self.hits_at_threshold.copy_(self.hits)
+        self.drawn_at_threshold.copy_(self.drawn)
+        threshold, active = self._last_threshold()
         faces, rings = self.avatar.surfaces[0].canonical.faces, self._settings.gate_rings
-        self.avatar.gate(dilate(active, faces, rings) if line.closed else self._first)
-        return line
+        self.avatar.gate(dilate(active, faces, rings) if threshold.closed else self._active_at_start)
+        return threshold
 
-    def _drawn(self) -> tuple[Line, Tensor]:
-        """The line through the scores as they were, and what lies above it."""
-        captured, generated = self.lined_hits / self.lined_drawn.clamp_min(1)[:, None]
-        line = self._line(self.whole_body(captured))
-        active = captured >= line.tau
+    def _last_threshold(self) -> tuple[Threshold, Tensor]:
+        """The threshold in the scores as they were when it was found, and what lies above it, [K] bool."""
+        captured, generated = self.hits_at_threshold / self.drawn_at_threshold.clamp_min(1)[:, None]
+        threshold = self._find_threshold(self.whole_body(captured))
+        active = captured >= threshold.tau
         if self._settings.unseen == "generated":
-            active |= (generated >= line.tau) & (self.lined_drawn[GENERATED] > 0)
-        if line.closed and not bool(active.any()):
-            why = f"a line at {line.tau:.2f} would gate all of the body, so none is drawn"
-            line = dataclasses.replace(line, tau=0.0, why=why)
-        return line, active
+            active |= (generated >= threshold.tau) & (self.drawn_at_threshold[GENERATED] > 0)
+        if threshold.closed and not bool(active.any()):
+            why = f"a line at {threshold.tau:.2f} would gate all of the body, so none is drawn"
+            threshold = dataclasses.replace(threshold, tau=0.0, why=why)
+        return threshold, active
 
-    def _line(self, scores: np.ndarray) -> Line:
-        settings = self._settings
-        if settings.gate_threshold is not None:
-            return fixed_threshold(scores, settings.gate_threshold)
-        return evidence_threshold(scores)
+    def _find_threshold(self, scores: np.ndarray) -> Threshold:
+        fixed = self._settings.gate_threshold
+        return evidence_threshold(scores) if fixed is None else fixed_threshold(scores, fixed)
 
     def write(self, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-        """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the line.
+        """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the threshold.
 
         Returns:
             The scores of the whole body, the higher of captured and generated, and what is kept; [V] each.
@@ -153,11 +156,11 @@ class Gate(nn.Module):
             folder / "visibility.parquet",
             captured=self.whole_body(captured),
             generated=self.whole_body(generated),
-            early=self.whole_body(self._first) == 0,
+            early=self.whole_body(self._active_at_start) == 0,
             kept=self.whole_body(self.avatar.active) == 1,
         )
-        line = self.line or self._line(self.whole_body(captured))
-        content = dataclasses.asdict(line) | {
+        threshold = self.threshold or self._find_threshold(self.whole_body(captured))
+        content = dataclasses.asdict(threshold) | {
             "definition": DEFINITION,
             "drawn": {"captured": int(self.drawn[CAPTURED]), "generated": int(self.drawn[GENERATED])},
         }
@@ -165,12 +168,29 @@ class Gate(nn.Module):
         return self.whole_body(torch.maximum(captured, generated)), self.whole_body(self.avatar.active) == 1
 
 
+def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: tuple[int, ...]) -> Tensor:
+    """The body vertices that lie in the picture of at least one of the frames, [K] bool.
+
+    Args:
+        avatar: untrained.
+        poses: of every frame.
+        views: the cameras.
+        frames: frame numbers.
+    """
+    seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
+    for frame in frames:
+        pose = poses.fitted(frame)
+        camera = moved(views.camera(frame), avatar.device)
+        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, camera)
+    return seen
+
+
 def write_ungated(folder: Path, vertices: int) -> None:
-    """What ``Gate.write`` writes, for a run in which nothing was counted and nothing gated."""
+    """Writes what ``VisibilityGate.write`` would, for a run without a gate."""
     nothing, everything = np.zeros(vertices), np.ones(vertices, bool)
     columns = {"captured": nothing, "generated": nothing, "early": ~everything, "kept": everything}
     write_visibility(folder / "visibility.parquet", **columns)
-    content = dataclasses.asdict(Line(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "the gate was off"))
+    content = dataclasses.asdict(Threshold(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "the gate was off"))
     write_json(folder / "gate.json", content | {"definition": None, "drawn": {"captured": 0, "generated": 0}})
 
 

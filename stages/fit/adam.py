@@ -1,4 +1,4 @@
-"""Minimising the objective: Adam over the whole clip, coarse to fine.
+"""Adam on the registration objective: over the whole clip, coarse to fine.
 
 Root, place and shape first; then pose and expression; then the offsets, which would otherwise absorb
 what a wrong pose leaves.
@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from pipeline.curves import Curve
 from pipeline.threads import threads
 from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
@@ -33,16 +35,53 @@ RATES = {
 
 ROOT_UNTIL, OFFSETS_FROM, ROBUST_FROM = 0.15, 0.4, 0.3
 WARM_UP = 10  # iterations over which the steps grow to their full length
+_POINTS = 16  # of the curve
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 """From which share of the iterations on steps have which width in time: standard deviation in frames."""
 
 
 Watch = Callable[[int, float, Callable[[], Parameters]], None]
-"""Called with the number of steps done, the loss before or after the last, and what gives the parameters."""
+"""Called with the number of steps done, the loss before the last, and what gives the parameters."""
 
 
 def ignore(step: int, loss: float, now: Callable[[], Parameters]) -> None:
-    """A watch that looks away."""
+    """A watch that does nothing."""
+
+
+class Recorder:
+    """A watch that notes the loss after every step and keeps the curve of the fit.
+
+    Attributes:
+        curve: ``loss`` and ``pixels``, the mean reprojection error of all trusted points, at a few steps.
+        seconds: (step, seconds since the start) of the same points, without the time they took themselves.
+    """
+
+    def __init__(self, objective: Objective, steps: int, report: Callable[[str], None]) -> None:
+        """Watch ``steps`` steps; ``report`` is called after each with a note on the loss."""
+        self.curve, self.seconds = Curve(), [(0, 0.0)]
+        self._objective, self._report = objective, report
+        self._points = {round(steps * (k + 1) / _POINTS) for k in range(_POINTS)}
+        self._idle, self._start = 0.0, time.monotonic()
+
+    def begin(self, initial: Parameters) -> None:
+        """The point before the first step."""
+        self._point(0, {}, initial)
+        self._idle, self._start = 0.0, time.monotonic()
+
+    def __call__(self, step: int, loss: float, now: Callable[[], Parameters]) -> None:
+        """Note a step, as a ``Watch`` does."""
+        if step in self._points:
+            self.seconds.append((step, time.monotonic() - self._start - self._idle))
+            self._point(step, {"loss": loss}, now())
+        self._report(f"loss {loss:.3f}")
+
+    def _point(self, step: int, values: dict[str, float], parameters: Parameters) -> None:
+        began = time.monotonic()
+        error = self._objective.residuals(parameters)
+        trusted = error[~torch.isnan(error)]
+        pixels = {"pixels": float(trusted.mean())} if len(trusted) else {}
+        self.curve.point(step, {**values, **pixels})
+        self._idle += time.monotonic() - began
 
 
 def rate(name: str, done: float, frozen: frozenset[str] = frozenset()) -> float:

@@ -1,4 +1,4 @@
-"""Which hand detections to believe."""
+"""Hand trust: the hand detections that the fit uses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LEAST_BONES = 6  # of the fingers' twelve, for what they measure to tell a coll
 
 
 def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, threshold: float) -> np.ndarray:
-    """Which hand detections to believe; detectors give no score that tells.
+    """The hands to trust among detections that have depth; detectors give no score that tells.
 
     A hand at the picture's edge has places for the points inside alone, and they are as good as those of
     a whole hand. So hands are judged by the points that they have, of which five are enough, and no rule
@@ -60,7 +60,7 @@ def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, thresh
 def _mean_length(
     places: np.ndarray, bones: tuple[tuple[int, int], ...], seen: np.ndarray, least: int
 ) -> np.ndarray:
-    """How long bones are on average.
+    """The mean length of bones.
 
     Bones with an unknown end are taken to be what they usually are beside the others, so that a part of
     a hand measures as the whole would.
@@ -83,19 +83,19 @@ def _mean_length(
 
 
 def _quantile(values: np.ndarray, share: float) -> float:
-    """Of the values that are known; NaN if none is."""
+    """The quantile of the values that are known; NaN if none is."""
     values = values[np.isfinite(values)]
     return float(np.quantile(values, share)) if len(values) else np.nan
 
 
 def _mean(values: np.ndarray) -> float:
-    """Of the values that are known; NaN if none is."""
+    """The mean of the values that are known; NaN if none is."""
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else np.nan
 
 
 def _distance(hand: np.ndarray, wrist: np.ndarray) -> np.ndarray:
-    """From a hand's own wrist, or if that is not known its nearest point, to another wrist.
+    """The distance from a hand's own wrist, or if that is not known its nearest point, to another wrist.
 
     Args:
         hand: [T, 21, 2], NaN where unknown.
@@ -119,7 +119,7 @@ def _middle(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def trusted_flat_hands(
     hands: np.ndarray, seen: np.ndarray, wrists: np.ndarray, seen_wrists: np.ndarray
 ) -> np.ndarray:
-    """Which hand detections to believe where nothing has depth: those of which most points are seen.
+    """The hands to trust where nothing has depth: those of which most points are seen.
 
     Where both hands were found at one place (their boxes overlap by more than half of their union), one
     goes. If the arms' wrists are seen, it is the hand that lies farther from its own wrist by more than

@@ -10,8 +10,8 @@ import torch
 from pipeline.body import locate, mean_identity, pose_body
 from pipeline.camera import facing_camera, project
 from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints
-from stages.fit.facing import TURNED, mesh_facing, points_facing, pose_facing
-from stages.fit.hands import trusted_flat_hands
+from stages.fit.face_direction import TURNED, mesh_facing, points_facing, pose_facing
+from stages.fit.hand_trust import trusted_flat_hands
 from stages.fit.observations import detected, observe
 from stages.fit.views import stack
 from tests.stages.fit_clip import load, make_clip, whole_body

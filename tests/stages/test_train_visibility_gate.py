@@ -12,11 +12,11 @@ from pipeline.plan import Decision, Plan
 from pipeline.records import read_json
 from pipeline.tables import read_table
 from stages.train import run as stage
+from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME
-from stages.train.gate import SCHEMA, Gate
 from stages.train.loop import Trainer
-from stages.train.obey import obey
 from stages.train.regularisers import Regularisers
+from stages.train.visibility_gate import SCHEMA, VisibilityGate
 from tests.plans import plan_of
 from tests.stages.test_train import Killed, bytes_of, trainer_for
 from tests.stages.train_subject import BODY_FILE, TINY, context_for, write_subject
@@ -60,9 +60,9 @@ def test_warm_up_ends_when_it_should_and_what_is_gated_is_gone(trainer):
     body = len(trainer.avatar.kept)
     for _ in range(2):
         trainer.step()
-    assert trainer.gate.line is None and len(trainer.avatar) == body
+    assert trainer.gate.threshold is None and len(trainer.avatar) == body
     trainer.step()
-    assert trainer.gate.line.closed and len(trainer.avatar) < 0.6 * body
+    assert trainer.gate.threshold.closed and len(trainer.avatar) < 0.6 * body
     decoded = trainer.avatar.decode(0)
     assert len(decoded.offset) == len(trainer.avatar) == int(trainer.avatar.active.sum())
     values = trainer.step()
@@ -136,16 +136,16 @@ def test_full_body_in_view_keeps_the_gate_open(trainer):
     trainer.gate.drawn[0] = 20
     trainer.gate.hits[0] = torch.randint(15, 21, trainer.gate.hits[0].shape)
     trainer.gate.update()
-    assert not trainer.gate.line.closed and bool(trainer.avatar.active.all())
+    assert not trainer.gate.threshold.closed and bool(trainer.avatar.active.all())
 
 
-def test_one_training_frame_is_enough_for_a_line(subject, tmp_path):
+def test_one_training_frame_is_enough_for_a_threshold(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "out", **LATE))
     trainer.evidence = dataclasses.replace(trainer.evidence, frames=(2,))
     trainer.objective.evidence = trainer.evidence
     for _ in range(4):
         trainer.step()
-    assert set(trainer.gate.scores()[0].unique().tolist()) == {0.0, 1.0} and trainer.gate.line.closed
+    assert set(trainer.gate.scores()[0].unique().tolist()) == {0.0, 1.0} and trainer.gate.threshold.closed
 
 
 @pytest.mark.parametrize("looks", [{}, {"gate_every": 100}], ids=["a look after it", "none after it"])
@@ -167,8 +167,8 @@ def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tm
     monkeypatch.undo()
     stage.run(context)
     assert bytes_of(context.output) == bytes_of(whole.output)
-    line = read_json(context.output / "gate.json", "")
-    assert line["drawn"] == {"captured": 12, "generated": 0} and line["tau"] > 0
+    found = read_json(context.output / "gate.json", "")
+    assert found["drawn"] == {"captured": 12, "generated": 0} and found["tau"] > 0
 
 
 def test_finer_level_is_gated_as_the_coarse_one(subject, tmp_path):
@@ -217,8 +217,8 @@ def test_finished_avatar_shows_nothing_or_the_base_where_nothing_was_seen(subjec
 )
 def test_training_builds_only_what_the_plan_names(effect, field, value):
     wanted = dataclasses.replace(TINY, subdivisions=2)
-    assert getattr(obey(wanted, plan_of(**{effect: False})), field) == value
-    assert getattr(obey(wanted, plan_of()), field) == getattr(wanted, field)
+    assert getattr(apply_plan(wanted, plan_of(**{effect: False})), field) == value
+    assert getattr(apply_plan(wanted, plan_of()), field) == getattr(wanted, field)
 
 
 @pytest.mark.parametrize(
@@ -228,11 +228,11 @@ def test_the_mesh_is_no_finer_than_the_plan_says_unless_it_was_told_to(wanted, f
     levels = Decision("subdivision", True, 2.0, 1.5, "pixels apart", "made up", forced, (1,))
     others = [one for one in plan_of().decisions if one.effect != "subdivision"]
     settings = dataclasses.replace(TINY, subdivisions=wanted)
-    assert obey(settings, Plan((*others, levels))).subdivisions == built
+    assert apply_plan(settings, Plan((*others, levels))).subdivisions == built
 
 
 def test_without_pose_heads_there_are_none(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "out", pose_heads_from=1.0))
     assert not [name for name, _ in trainer.avatar.named_parameters() if name.startswith("pose_")]
     trainer.step()
-    assert isinstance(trainer.gate, Gate) and not trainer.avatar.pose_heads_active
+    assert isinstance(trainer.gate, VisibilityGate) and not trainer.avatar.pose_heads_active

@@ -1,10 +1,4 @@
-"""What the training frames show of the body before training: which vertices to keep, and their colours.
-
-A clip of a head says nothing about the feet. Where no training frame has a vertex in its picture, the
-score of the paper's Section 3.4 is zero whatever training does, and the gate (``gate.py``) would take it
-out after the warm-up; so it gets no Gaussian to begin with. That saves the warm-up's time, and the
-triplane is fitted to what is left.
-"""
+"""Colours at the start of training, from what the frames show, and colours of what no frame showed."""
 
 from __future__ import annotations
 
@@ -14,45 +8,23 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar
-from pipeline.avatar.canonical import dilate
 from pipeline.avatar.sparse import SparsePair
 from pipeline.device import moved
 from pipeline.splat import Gaussians, render
-from pipeline.visibility import body_in_frame
 from stages.train.data import Frames
 from stages.train.poses import PoseRefinement
 
-DARKEST, BRIGHTEST = 0.02, 0.98  # first colours stay where the sigmoid still has a slope
-BELIEVED = 0.5  # trust from which a pixel of a generated frame has a say in first colours
-INSIDE = 0.5 + 0.125**0.5  # alpha beyond which a pixel has a say: a coin of that mean has half the variance
-THROUGH = 0.1  # of the weight in generated frames, under which what captured frames show is not the surface
-SPREAD_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
+DARKEST, BRIGHTEST = 0.02, 0.98  # initial colours stay where the sigmoid still has a slope
+LEAST_TRUST = 0.5  # from which a pixel of a generated frame counts
+LEAST_ALPHA = 0.5 + 0.125**0.5  # above which a pixel counts: 4 a (1 - a), the mask's variance, is under 1/2
+# A Gaussian whose mean weight in captured frames is under this share of that in generated ones only shines
+# through the surface there.
+SHINES_THROUGH = 0.1
+FILL_ROUNDS = 16  # rings over which unseen vertices take their neighbours' colour
 
 
-def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: tuple[int, ...]) -> Tensor:
-    """The body vertices that lie in the picture of at least one of the frames, [K] bool.
-
-    Args:
-        avatar: untrained.
-        poses: of every frame.
-        views: the cameras.
-        frames: frame numbers.
-    """
-    seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
-    for frame in frames:
-        pose = poses.fitted(frame)
-        camera = moved(views.camera(frame), avatar.device)
-        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, camera)
-    return seen
-
-
-def with_surroundings(avatar: Avatar, seen: Tensor, rings: int) -> Tensor:
-    """What is seen and ``rings`` rings of neighbours: what offsets and refined poses may bring in."""
-    return dilate(seen, avatar.surfaces[0].canonical.faces, rings)
-
-
-def fill_unseen(avatar: Avatar) -> None:
-    """Gives what is gated the colours of what is next to it, for ``Avatar.unseen = "base"``."""
+def color_unseen(avatar: Avatar) -> None:
+    """Gives gated vertices the colours of their neighbours, for ``Avatar.unseen = "base"``."""
     full, surface = avatar.surfaces[-1], avatar.surface()
     if surface.rows is None:
         return
@@ -61,11 +33,11 @@ def fill_unseen(avatar: Avatar) -> None:
         color[surface.rows] = torch.sigmoid(avatar.decode().color_logit)
         known = torch.zeros(len(color), 1, device=avatar.device)
         known[surface.rows] = 1
-        filled = torch.logit(fill(color, known, full.neighbours).clamp(DARKEST, BRIGHTEST))
+        filled = torch.logit(fill_from_neighbours(color, known, full.neighbours).clamp(DARKEST, BRIGHTEST))
         avatar.base_color.copy_(torch.where(known > 0, avatar.base_color, filled))
 
 
-def first_colors(
+def initial_color_logits(
     avatar: Avatar,
     poses: PoseRefinement,
     views: Frames,
@@ -85,20 +57,20 @@ def first_colors(
         chosen: frame numbers.
         made: generated frames; they are asked for what no chosen frame shows.
     """
-    total, weight = _shown(avatar, poses, views, chosen)
+    total, weight = _summed_colors(avatar, poses, views, chosen)
     if made:
-        total_made, weight_made = _shown(avatar, poses, views, made)
+        total_made, weight_made = _summed_colors(avatar, poses, views, made)
         # A little of what lies behind shines through: a back has weight in a front view, and its colours.
-        unseen = weight / len(chosen) < THROUGH * weight_made / len(made)
+        unseen = weight / len(chosen) < SHINES_THROUGH * weight_made / len(made)
         total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
     neighbours = avatar.surfaces[-1].neighbours
-    return torch.logit(fill(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
+    return torch.logit(fill_from_neighbours(total, weight, neighbours).clamp(DARKEST, BRIGHTEST))
 
 
-def _shown(
+def _summed_colors(
     avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Colours that some frames show at each Gaussian, summed by blending weight, and the weights.
+    """The colours that frames show at each Gaussian, summed by blending weight, and the summed weights.
 
     Returns:
         [N, 3] and [N, 1].
@@ -111,21 +83,21 @@ def _shown(
         colors = gaussians.colors.clone().requires_grad_()
         color = render(dataclasses.replace(gaussians, colors=colors), view.camera).color
         # All or nothing: a mean does not feel a small weight that all of its members share.
-        believed = view.alpha > INSIDE
+        person = view.alpha > LEAST_ALPHA
         if view.trust is not None:
-            believed &= view.trust >= BELIEVED
-        person = believed.float()[..., None]
-        total += torch.autograd.grad((color * view.color * person).sum(), colors, retain_graph=True)[0]
-        weight += torch.autograd.grad((color[..., :1] * person).sum(), colors)[0][:, :1]
+            person &= view.trust >= LEAST_TRUST
+        counts = person.float()[..., None]
+        total += torch.autograd.grad((color * view.color * counts).sum(), colors, retain_graph=True)[0]
+        weight += torch.autograd.grad((color[..., :1] * counts).sum(), colors)[0][:, :1]
     return total, weight
 
 
-def fill(total: Tensor, weight: Tensor, neighbours: SparsePair) -> Tensor:
-    """Mean colours, [N, 3]; what has no weight takes those of its neighbours, then the overall mean."""
+def fill_from_neighbours(total: Tensor, weight: Tensor, neighbours: SparsePair) -> Tensor:
+    """Mean colours, [N, 3]; vertices without weight take their neighbours' colours, else the overall mean."""
     known = (weight > 0).float()
     color = total / weight.clamp_min(1e-12) * known
     overall = total.sum(0) / weight.sum().clamp_min(1e-12)
-    for _ in range(SPREAD_ROUNDS):
+    for _ in range(FILL_ROUNDS):
         near, share = neighbours @ (color * known), neighbours @ known
         reached = (known == 0) & (share > 0)
         color = torch.where(reached, near / share.clamp_min(1e-12), color)

@@ -1,4 +1,4 @@
-"""The settings of a run once the plan has been heard: what it does not name is not built."""
+"""The settings of a run with the plan applied: what the plan calls needless is not built."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ RESIDUALS = ("face", "left_hand", "right_hand")
 MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 
 
-def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
-    """Switches off what the plan calls needless; it never switches on what settings left out.
+def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
+    """The settings with what the plan calls needless switched off; the plan switches nothing on.
 
     Args:
         settings: as set.
@@ -24,7 +24,7 @@ def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
         settings,
         residual_parts=parts,
         residual_from=settings.residual_from if parts else 1.0,
-        subdivisions=min(settings.subdivisions, levels_of(plan)),
+        subdivisions=min(settings.subdivisions, subdivision_levels(plan)),
         pose_heads_from=settings.pose_heads_from if plan.on("pose_heads") else 1.0,
         refine_poses=settings.refine_poses and plan.on("pose_refinement"),
         face=settings.face if plan.on("face_loss") else 0.0,
@@ -32,8 +32,8 @@ def obey(settings: TrainSettings, plan: Plan) -> TrainSettings:
     )
 
 
-def levels_of(plan: Plan) -> int:
-    """How many levels of subdivision the plan leaves: all where a setting switched it on."""
+def subdivision_levels(plan: Plan) -> int:
+    """The most levels of subdivision that the plan allows: all where a setting switched it on."""
     decision = plan["subdivision"]
     if not decision.on:
         return 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from stages.fit.hands import trusted_hands
+from stages.fit.hand_trust import trusted_hands
 from stages.fit.observations import observe
 from stages.fit.registration import views_of
 from stages.ingest.mannequin.footage import make_mannequin

@@ -1,4 +1,4 @@
-"""How far joints turn: soft limits on the components of their rotation vectors.
+"""Joint limits: soft bounds on the components of their rotation vectors.
 
 Axes are the schema's: in the T pose the arms lie along X with the palms down, so that an elbow bends
 about Y, a finger bends about Z, and X is the twist of either. Left and right mirror each other in Y and
@@ -20,7 +20,7 @@ _FREE = 10.0  # radians: no limit
 
 
 @dataclasses.dataclass(frozen=True)
-class Ranges:
+class JointLimits:
     """Limits of K components of theta.
 
     Attributes:
@@ -38,11 +38,11 @@ class Ranges:
         return rotation.flatten(1)[:, 3 * self.joint + self.axis]
 
 
-def joint_ranges() -> Ranges:
+def joint_limits() -> JointLimits:
     """The limits of knees, elbows, wrists, fingers and the jaw."""
     joints, axes, lows, highs = zip(*_limits(), strict=True)
     indices = torch.tensor([joint_index(name) for name in joints])
-    return Ranges(indices, torch.tensor(axes), torch.tensor(lows), torch.tensor(highs))
+    return JointLimits(indices, torch.tensor(axes), torch.tensor(lows), torch.tensor(highs))
 
 
 def _limits() -> Iterator[tuple[str, int, float, float]]:

@@ -1,4 +1,4 @@
-"""Whether a face looks towards the camera, as a cosine: 1 straight into it, 0 in profile, -1 away from it.
+"""Face direction: the cosine at which a face looks into the camera, 1 straight, 0 in profile, -1 away.
 
 A face that is turned away is returned by detectors all the same, as a guess. The angle is taken against
 the camera's axis: estimators look at a crop around the face, so its place in the picture is gone.
@@ -28,7 +28,7 @@ _EYES_OVER_HEIGHT = 0.9  # distance of the eyes over that from eyes to mouth, of
 
 
 def mesh_facing(mesh: np.ndarray) -> np.ndarray:
-    """From the normal of a face mesh, whose points have depth.
+    """The cosine from the normal of a face mesh, whose points have depth.
 
     Args:
         mesh: [T, 478, 3 or 4], x right, y down, z away, in pixels.
@@ -48,7 +48,7 @@ def mesh_facing(mesh: np.ndarray) -> np.ndarray:
 
 
 def points_facing(face: np.ndarray, ears: np.ndarray, threshold: float) -> np.ndarray:
-    """From 68 points without depth.
+    """The cosine from 68 points without depth.
 
     A face seen from the front has its eyes and mouth in a winding order, and the triangle between them
     narrows as the face turns. From behind, detectors imagine a face that looks out of the picture; then
@@ -74,7 +74,7 @@ def points_facing(face: np.ndarray, ears: np.ndarray, threshold: float) -> np.nd
 
 
 def pose_facing(rotation: Tensor, parents: tuple[int, ...], views: Views) -> np.ndarray:
-    """From the head of a posed body: [T, 55, 3] rotation vectors -> [T]."""
+    """The cosine from the head of a posed body: [T, 55, 3] rotation vectors -> [T]."""
     head = joint_orientations(rotation, parents)[:, joint_index("head")]
     ahead = (views.rotation @ head)[..., 2]  # the face looks along its +Z
     return (-ahead[:, 2]).double().numpy()

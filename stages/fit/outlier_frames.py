@@ -1,14 +1,15 @@
-"""Frames whose detections are not believed: left taken for right, and nonsense between two that agree.
+"""Outlier frames: left and right swapped by the detector, or one that no neighbour agrees with.
 
-Either lasts a frame or a few, and costs more than those: the start turns the body round there, and steps that
-are wide in time carry the neighbours along (one exchanged frame of 24 turned a dozen others by 30 to 140
-degrees; one frame of nonsense of 16 all others by 20). What lies around such frames says where the body is.
+Such frames come alone or a few in a row, and harm more than themselves: the start turns the body round
+there, and the fit's first steps, which are wide in time, carry the neighbours along (one swapped frame of
+24 turned a dozen others by 30 to 140 degrees; one nonsensical frame of 16 all others by 20). The frames
+around them say where the body is, so the detections of outlier frames are masked.
 
-**Exchanged.** A body cannot turn round between two frames of a film. So where exchanging left and right
-brings a frame's points much nearer to those of the frame before, one of the two is exchanged; of the
-stretches between such places every other one is, and it is the shorter ones that are not believed.
+**Swapped.** A body cannot turn round between two frames of a film. So where swapping left and right brings
+a frame's points much nearer to those of the frame before, one of the two is swapped. Of the stretches
+between such places every other one is swapped, and the shorter ones are taken to be.
 
-**Nonsense.** Nor can it move by much of its own length and back again within a frame or two.
+**Isolated.** Nor can it move by much of its own length and back again within a frame or two.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ _FACE_OF_POSE = 11  # MediaPipe's first points are the head's
 _SCORE = 0.4  # of a point, or of both points of a pair
 _LEAST = 2  # pairs that must be seen
 _SOON = 3  # frames of the footage within which nobody turns round, or moves and is back
-_NEARER = 0.3  # the exchanged points' distance, of the others'
+_NEARER = 0.3  # the swapped points' distance, of the others'
 _APART = 0.12  # least distance of left and right, of the body's extent; less is a side view
-_LONGEST = 5  # frames of an exchanged stretch that is not believed
-_FAR, _NEAR = 0.4, 0.15  # mean distance of nonsense from its neighbours, and of these, of the extent
+_LONGEST = 5  # frames of a swapped stretch that is masked
+_FAR, _NEAR = 0.4, 0.15  # mean distance of an isolated frame from its neighbours, and of these, of the extent
 
 
-def without_doubted(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
-    """The detections, with body and hands unseen in frames that are not believed.
+def mask_outlier_frames(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
+    """The detections with body and hands unseen in outlier frames, and the numbers of these frames.
 
     Returns:
         The detections, the same where there is no such frame, and these frames' numbers.
@@ -42,7 +43,9 @@ def without_doubted(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
     if not (points[..., 2] > 0).any():
         points, pairs = keypoints.whole_body, BODY_PAIRS
     left, right = (points[:, [pair[side] for pair in pairs]] for side in (0, 1))
-    rows = np.union1d(exchanged(keypoints.frames, left, right), nonsense(keypoints.frames, left, right))
+    rows = np.union1d(
+        left_right_swapped(keypoints.frames, left, right), isolated_outliers(keypoints.frames, left, right)
+    )
     if not len(rows):
         return keypoints, []
     names = ("pose_image", "pose_world", "hands", "whole_body")
@@ -55,8 +58,8 @@ def without_doubted(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
     return dataclasses.replace(keypoints, **unseen), keypoints.frames[rows].tolist()
 
 
-def exchanged(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The rows in which left and right are exchanged: indices, increasing.
+def left_right_swapped(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The rows in which left and right are swapped: indices, increasing.
 
     Args:
         frames: [T], frame numbers, increasing.
@@ -74,15 +77,15 @@ def exchanged(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.nda
         stretch[place + 1] = stretch[place] + turned
     lengths = np.bincount(stretch)
     odd = lengths[1::2].sum() > lengths[::2].sum()  # which of the two ways round is the common one
-    doubted = [number for number, length in enumerate(lengths) if number % 2 != odd and length <= _LONGEST]
-    return usable[np.isin(stretch, doubted)]
+    swapped = [number for number, length in enumerate(lengths) if number % 2 != odd and length <= _LONGEST]
+    return usable[np.isin(stretch, swapped)]
 
 
-def nonsense(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def isolated_outliers(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The rows that are far from both neighbours, which are near to each other: indices, increasing.
 
     Args:
-        frames, left, right: as for ``exchanged``.
+        frames, left, right: as for ``left_right_swapped``.
     """
     seen, usable = _seen(left, right)
     found = []
@@ -99,14 +102,14 @@ def nonsense(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndar
 
 
 def _seen(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which pairs are seen in each frame, [T, P] bool, and the rows that show enough of them."""
+    """The pairs that are seen in each frame, [T, P] bool, and the rows that show enough of them."""
     scored = np.minimum(left[..., 2], right[..., 2]) >= _SCORE
     seen = scored & np.isfinite(left).all(-1) & np.isfinite(right).all(-1)
     return seen, np.flatnonzero(seen.sum(1) >= _LEAST)
 
 
 def _crossed(left: np.ndarray, right: np.ndarray) -> bool:
-    """Whether left and right of two frames, [2, P, 2] each, agree better when exchanged in one of them."""
+    """True if left and right of two frames, [2, P, 2] each, agree better when swapped in one of them."""
     extent = max(_extent(np.concatenate(frame)) for frame in zip(left, right, strict=True))
     same = _distance(np.concatenate([left[0], right[0]]), np.concatenate([left[1], right[1]]))
     turned = _distance(np.concatenate([left[0], right[0]]), np.concatenate([right[1], left[1]]))

@@ -1,4 +1,4 @@
-"""How long training has taken, a killed run's part included; goes to run.json, never to what is published."""
+"""The time that training has taken, a killed run's part included; for run.json, never for published files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 
 from pipeline.compiling import CompileTimer
 
-NAME = "clock.json"
+NAME = "timer.json"
 
 Mark = tuple[int, float, float]
 """Iterations done, and the wall-clock and processor seconds that they took."""
 
 
-class Clock:
-    """Seconds of the iterations alone: what is compiled or only looked at on the way does not count.
+class TrainingTimer:
+    """Seconds of the iterations alone: compiling and scoring on the way do not count.
 
     Attributes:
         marks: of the points of the curve.
@@ -62,17 +62,17 @@ class Clock:
         )
 
     def mark(self, iteration: int) -> None:
-        """Notes a point of the curve."""
+        """Adds a mark for a point of the curve."""
         self.marks.append(self.now(iteration))
 
     def save(self, iteration: int) -> None:
-        """To be called when a checkpoint has been written."""
+        """Stores the marks beside a checkpoint that has just been written."""
         state = {"earlier": self.now(iteration), "marks": self.marks}
         self._file.write_text(json.dumps(state), encoding="utf-8")
 
     @contextlib.contextmanager
-    def aside(self) -> Iterator[None]:
-        """What happens inside is not training."""
+    def paused(self) -> Iterator[None]:
+        """A context in which no time counts."""
         before = self._spent()
         try:
             yield
