@@ -19,7 +19,7 @@ from pipeline.frames import write_png, write_video
 from pipeline.job import peak_memory, shown
 from pipeline.metrics import Lpips
 from pipeline.metrics.identity import FaceReader
-from pipeline.plan import Plan, read_plan
+from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.records import write_json
 from pipeline.settings import as_dict
 from pipeline.splat import Gaussians, write_ply
@@ -50,7 +50,6 @@ from stages.evaluate.report.pictures import (
     empty_comparisons,
 )
 from stages.evaluate.report.plots import plot_registration, plot_training, plot_visibility
-from stages.evaluate.report.tables import plan_rows
 from stages.evaluate.report.terminal import show_summary
 from stages.evaluate.report.videos import motion_pictures, turntable_pictures
 from stages.evaluate.scores import TableRow, frames_to_score, score_clip, score_table, write_scores
@@ -321,7 +320,7 @@ def report_contents(
         registration_plots=plot_registration(registration, fit_seconds(fit)),
         visibility_plots=plot_visibility(gate.scores, gate.tau),
         visibility_picture=train / "visibility.png",
-        plan=plan_rows(plan),
+        plan=[plan[effect] for effect in EFFECTS],
         gate=gate.why,
         refinement_cost=refinement_cost(context, refined),
         omissions=omissions(clip.footage, clip.split, settings, table, gate, plan, refined),

@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import jinja2
 import numpy as np
-from markupsafe import Markup
 
+from pipeline.plan import Decision
 from stages.evaluate.report import tables
 from stages.evaluate.report.omissions import Omission
 from stages.evaluate.report.pictures import Closeup, Comparison
@@ -45,7 +45,7 @@ class ReportContents:
         registration_plots: of what accuracy cost the registration, SVG.
         visibility_plots: of the visibility scores, SVG; none where nothing was counted.
         visibility_picture: the body coloured by score, where it exists.
-        plan: what the scene called for, a row an effect.
+        plan: what the scene called for, a decision an effect.
         gate: the gate's own sentence.
         refinement_cost: what refining the test poses took; empty where they were not.
         omissions: what was left out.
@@ -66,7 +66,7 @@ class ReportContents:
     registration_plots: Sequence[str]
     visibility_plots: Sequence[str]
     visibility_picture: Path
-    plan: Sequence[tables.PlanRow]
+    plan: Sequence[Decision]
     gate: str
     refinement_cost: str
     omissions: Sequence[Omission]
@@ -80,44 +80,32 @@ def write_report(path: Path, contents: ReportContents) -> None:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
+    environment.filters |= {"picture_uri": picture_uri, "video_uri": video_uri}
     template = environment.get_template("report.html.jinja")
     path.write_text(template.render(_template_values(contents)), encoding="utf-8")
 
 
 def _template_values(contents: ReportContents) -> dict[str, Any]:
-    summary = contents.summary
+    """The contents by their names, what is embedded of them, and the tables that the summary fills."""
+    summary, stages = contents.summary, contents.stages
     script = (Path(__file__).parent / _SCRIPT).read_text(encoding="utf-8")
     return {
-        "subject": summary["subject"],
-        "summary": summary,
+        **vars(contents),
         "held_out": HELD_OUT in summary["means"],
-        "clip": contents.clip,
-        "cover": [picture_uri(picture) for picture in contents.cover],
         "cover_columns": " ".join(f"{one.shape[1] / one.shape[0]:.4f}fr" for one in contents.cover),
+        "slider_quality": _SLIDER_QUALITY,
+        "closeup_names": {"face": "Face", "hands": "Hand"},
         "table": tables.main_table(summary),
         "composites": tables.composite_table(summary),
         "regions": tables.region_tables(summary),
         "consistency": tables.consistency_table(summary),
         "cameras": tables.camera_table(summary),
-        "closeups": [_closeup(one) for one in contents.closeups],
-        "comparisons": [_comparison(one) for one in contents.comparisons],
-        "error_gain": f"{contents.error_gain:g}",
-        "turntable": video_uri(contents.turntable),
         "motion": _embedded([contents.motion]),
         "overlay": _embedded(contents.overlay),
-        "curve": [Markup(plot) for plot in contents.training_plots],
-        "fit_curve": [Markup(plot) for plot in contents.registration_plots],
-        "visibility": [Markup(plot) for plot in contents.visibility_plots],
         "visibility_picture": _embedded([contents.visibility_picture]),
-        "plan": contents.plan,
-        "gate": contents.gate,
-        "refinement_cost": contents.refinement_cost,
-        "omissions": contents.omissions,
-        "stages": contents.stages,
-        "total": _total(contents.stages),
-        "peak": max((stage.memory for stage in contents.stages if stage.memory), default=None),
-        "versions": contents.versions,
-        "script": Markup(script),
+        "total": sum(stage.seconds or 0.0 for stage in stages),
+        "peak": max((stage.memory for stage in stages if stage.memory), default=None),
+        "script": script,
         "script_hash": script_hash(script),
     }
 
@@ -125,16 +113,6 @@ def _template_values(contents: ReportContents) -> dict[str, Any]:
 def script_hash(script: str) -> str:
     """The hash by which the page's policy admits this script and no other."""
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-
-
-def _comparison(one: Comparison) -> dict[str, Any]:
-    truth, render, error = (picture_uri(picture, _SLIDER_QUALITY) for picture in one.pictures)
-    return {"frame": one.frame, "psnr": f"{one.psnr:.2f}", "truth": truth, "render": render, "error": error}
-
-
-def _closeup(one: Closeup) -> dict[str, Any]:
-    name = "Face" if one.region == "face" else "Hand"
-    return {"name": name, **_comparison(one.comparison)}
 
 
 def _embedded(candidates: Sequence[Path]) -> dict[str, str] | None:
@@ -145,11 +123,6 @@ def _embedded(candidates: Sequence[Path]) -> dict[str, str] | None:
                 return {"kind": "video", "uri": video_uri(path)}
             return {"kind": "picture", "uri": _uri("image/png", path.read_bytes())}
     return None
-
-
-def _total(stages: Sequence[StageRecord]) -> float | None:
-    seconds = [stage.seconds for stage in stages if stage.seconds is not None]
-    return sum(seconds) if seconds else None
 
 
 def picture_uri(image: np.ndarray, quality: int = _JPEG_QUALITY) -> str:

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.plan import EFFECTS, Plan
 from stages.evaluate.methods import AVATAR, CEILING, MEAN, MESH, NEAREST, REFINED
 from stages.evaluate.scores import HELD_OUT, OTHER_CAMERA, TRAINING, VIEWS
 from stages.evaluate.statistics import Means
@@ -182,40 +181,6 @@ def _cell(summary: Mapping[str, Any], split: str, method: str, metric: str) -> N
 
 def _heading(metric: str) -> tuple[str, str]:
     return label(metric), "↓" if lower_is_better(metric) else "↑"
-
-
-@dataclasses.dataclass(frozen=True)
-class PlanRow:
-    """One effect.
-
-    Attributes:
-        effect: its name.
-        on: true where it was built.
-        forced: true where a setting said so.
-        measured, threshold: numbers, the latter with its unit.
-        why: one sentence.
-    """
-
-    effect: str
-    on: bool
-    forced: bool
-    measured: str
-    threshold: str
-    why: str
-
-
-def plan_rows(plan: Plan) -> list[PlanRow]:
-    """The decisions in the order of the list of effects."""
-    found = []
-    for effect in EFFECTS:
-        one, name = plan[effect], effect.replace("_", " ")
-        measured, threshold = _three_digits(one.measured), f"{_three_digits(one.threshold)} {one.unit}"
-        found.append(PlanRow(name, one.on, one.forced, measured, threshold, one.why))
-    return found
-
-
-def _three_digits(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def rows(means: Means) -> list[tuple[str, str, Mapping[str, float | None]]]:
