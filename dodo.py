@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
@@ -227,19 +227,25 @@ def task_prune():
         }
 
 
+def run_studies(studies: Iterable[Callable[[Request], object]]) -> TaskFailed | None:
+    """Makes studies one after the other; one that fails does not stop the others."""
+    reasons = []
+    for study in studies:
+        try:
+            study(REQUEST)
+        except (UserError, OSError) as error:
+            reasons.append(str(error))
+    return TaskFailed("; ".join(reasons)) if reasons else None
+
+
 def compare_datasets() -> TaskFailed | None:
     """Makes the tables of the chosen datasets."""
-    from pipeline.compare import compare
+    from pipeline.studies.compare import compare
 
     if not REQUEST.datasets:
         known = ", ".join(known_datasets(WORKSPACE))
         return TaskFailed(f"compare needs a dataset: doit run compare dataset=NAME; there are {known}")
-    try:
-        for name in REQUEST.datasets:
-            compare(name, REQUEST)
-    except UserError as error:
-        return TaskFailed(str(error))
-    return None
+    return run_studies(functools.partial(compare, name) for name in REQUEST.datasets)
 
 
 def task_compare():
@@ -268,30 +274,16 @@ def ablate_subjects() -> TaskFailed | None:
     """Makes the ablation of each dataset, or of each subject."""
     from pipeline.studies.ablation import ablate
 
-    studies = (
-        [(one, (one,)) for one in CHOSEN]
-        if REQUEST.subjects or not REQUEST.datasets
-        else [(name, subjects_of(WORKSPACE, name)) for name in REQUEST.datasets]
-    )
-    return each_study([functools.partial(ablate, name, subjects) for name, subjects in studies])
+    named = () if REQUEST.subjects else REQUEST.datasets
+    groups = {name: subjects_of(WORKSPACE, name) for name in named} or {one: (one,) for one in CHOSEN}
+    return run_studies(functools.partial(ablate, name, group) for name, group in groups.items())
 
 
 def tradeoff_subjects() -> TaskFailed | None:
     """Makes the study of what accuracy costs of each subject."""
     from pipeline.studies.tradeoff import tradeoff
 
-    return each_study([functools.partial(tradeoff, subject) for subject in CHOSEN])
-
-
-def each_study(studies: list[Callable[[dict[str, str]], object]]) -> TaskFailed | None:
-    """Makes studies one after the other; one that fails does not stop the others."""
-    reasons = []
-    for study in studies:
-        try:
-            study(REQUEST.words())
-        except (UserError, OSError) as error:
-            reasons.append(str(error))
-    return TaskFailed("; ".join(reasons)) if reasons else None
+    return run_studies(functools.partial(tradeoff, subject) for subject in CHOSEN)
 
 
 def studied_assets() -> list[str]:

@@ -26,7 +26,7 @@ from pipeline.config.request import parse_request
 from pipeline.frames import read_frame, write_png
 from pipeline.job import open_job
 from pipeline.metrics import Lpips
-from pipeline.study import made
+from pipeline.process import make_results
 from stages.evaluate.frame_metrics import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
@@ -97,7 +97,7 @@ Table = dict[str, dict[str, Numbers]]
 def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
     """Trains one variant on one subject and scores it."""
     job = open_job(subject, parse_request(words, subject))
-    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
+    folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
     scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})
     if variant == NEAREST:

@@ -22,10 +22,10 @@ from pipeline.job import Job
 from pipeline.keypoints import COUNT, FACE, LEFT_HAND, RIGHT_HAND, read_keypoints
 from pipeline.metrics.image import psnr
 from pipeline.metrics.protocol import composite, interior
+from pipeline.process import make_results
 from pipeline.records import read_cameras, read_footage, read_split
 from pipeline.splat import Rendering, render
 from pipeline.stage import Context
-from pipeline.study import made
 from stages.evaluate.baselines import nearest_frames
 from stages.evaluate.frame_metrics import Scorer
 from stages.train import run as train
@@ -56,7 +56,7 @@ def trained(job: Job, **instead: Path) -> Trained:
         job: whose avatar, and under which settings.
         instead: folders that stand in for upstream stages' published ones.
     """
-    upstream = made(job, job.stages["train"].needs)
+    upstream = make_results(job, job.stages["train"].needs)
     demands = job.stages["train"].demands(job.settings["train"])
     with tempfile.TemporaryDirectory() as folder:
         places = {name: Path(folder) / name for name in ("output", "work")}

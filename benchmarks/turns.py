@@ -28,9 +28,9 @@ from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.job import open_job
 from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
 from pipeline.metrics.protocol import composite
+from pipeline.process import make_results
 from pipeline.records import read_split
 from pipeline.splat import Gaussians, render
-from pipeline.study import made
 from pipeline.turntable import orbit, visible_extent
 from stages.evaluate.frame_metrics import Scorer
 
@@ -120,7 +120,7 @@ def mean(values: list[float]) -> float:
 def try_way(subject: str, way: str, words: dict[str, str]) -> tuple[Row, np.ndarray]:
     """Trains one way on one subject; its numbers and its sides."""
     job = open_job(subject, parse_request({**words, **WAYS[way]}, subject))
-    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
+    folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
     done = trained(job)
     clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
     reader = FaceReader(*(job.workspace.assets / asset for asset in ASSETS))

@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +149,13 @@ class Job:
         if artifact is not None:
             self.store.settle(artifact)
         return artifact is not None
+
+    def upstream_first(self, wanted: Iterable[str]) -> list[str]:
+        """Some stages and all that they need, in the order in which they run."""
+        found = set(wanted)
+        for name in reversed(list(self.stages)):
+            found |= set(self.stages[name].needs) if name in found else set()
+        return [name for name in self.stages if name in found]
 
     def needed_assets(self, name: str) -> list[str]:
         """The assets that a stage needs, its footage's included."""

@@ -1,4 +1,4 @@
-"""A stage in a process of its own, and why it failed."""
+"""Stages run in processes of their own, and why one failed."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from pipeline.artifact import Artifact
 from pipeline.config.request import Request
+from pipeline.errors import UserError
+from pipeline.job import Job
+from pipeline.stage import usual
 
 REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
@@ -98,3 +103,44 @@ def _end_with(parent: int) -> None:
         ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGTERM)
         if os.getppid() != parent:  # it was killed before the kernel knew
             os._exit(1)
+
+
+def make_results(
+    job: Job, stages: Iterable[str] | None = None, log: Path | None = None
+) -> dict[str, Artifact]:
+    """The results of some stages and of all that they need; what the store lacks is run first.
+
+    ``latest`` is left pointing where it pointed before.
+
+    Args:
+        job: whose, and under which settings.
+        stages: names; all that run without being asked for if None.
+        log: a file that gets the stages' own lines in place of this terminal.
+
+    Raises:
+        UserError: a stage stopped.
+    """
+    found = {}
+    with _latest_kept(job):
+        for stage in job.upstream_first(usual(job.stages) if stages is None else stages):
+            if job.find(stage) is None:
+                reason = run_stage_process(stage, job.subject.name, job.request, log)
+                if reason:
+                    raise UserError(f"{stage}:{job.subject.name} {reason}")
+            artifact = job.find(stage)
+            if artifact is None:
+                raise UserError(f"{stage}:{job.subject.name} ran, and its result is not in the store")
+            found[stage] = artifact
+    return found
+
+
+@contextlib.contextmanager
+def _latest_kept(job: Job) -> Iterator[None]:
+    """Puts every stage's ``latest`` back to what it was."""
+    before = {stage: job.store.latest(job.subject.name, stage) for stage in job.stages}
+    try:
+        yield
+    finally:
+        for artifact in before.values():
+            if artifact is not None and artifact.folder.is_dir():
+                job.store.select(artifact)

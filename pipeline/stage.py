@@ -10,13 +10,12 @@ import contextlib
 import dataclasses
 import importlib
 import pkgutil
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.run.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,38 +146,6 @@ def usual(stages: Mapping[str, Stage]) -> list[str]:
     return [name for name, stage in stages.items() if not stage.on_request]
 
 
-class Progress:
-    """A bar with ETA on a terminal; elsewhere a line at most every ten seconds."""
-
-    QUIET_SECONDS = 10.0
-
-    def __init__(self, total: int, label: str) -> None:
-        from tqdm import tqdm
-
-        self.total, self.label, self.done = total, label, 0
-        self.start = self.last = time.monotonic()
-        self.bar = tqdm(total=total, desc=label, unit="", dynamic_ncols=True) if sys.stderr.isatty() else None
-
-    def advance(self, steps: int = 1, note: str = "") -> None:
-        """Counts ``steps`` more as done; ``note`` is shown beside the bar."""
-        self.done += steps
-        if self.bar is not None:
-            if note:
-                self.bar.set_postfix_str(note, refresh=False)
-            self.bar.update(steps)
-            return
-        now = time.monotonic()
-        if now - self.last >= self.QUIET_SECONDS:
-            self.last = now
-            left = (now - self.start) / max(self.done, 1) * (self.total - self.done)
-            print(f"{self.label}: {self.done}/{self.total}, {left:.0f} s left {note}".rstrip(), flush=True)
-
-    def close(self) -> None:
-        """Takes the bar away."""
-        if self.bar is not None:
-            self.bar.close()
-
-
 @dataclasses.dataclass(frozen=True)
 class Context:
     """What a stage's ``run`` is given.
@@ -211,9 +178,9 @@ class Context:
     loans: Mapping[str, Path] = dataclasses.field(default_factory=dict)
 
     @contextlib.contextmanager
-    def progress(self, total: int, label: str) -> Iterator[Progress]:
-        """A progress display for ``total`` steps."""
-        progress = Progress(total, f"{self.stage}:{self.subject} {label}")
+    def progress(self, total: int, label: str, costs: Sequence[float] | None = None) -> Iterator[Progress]:
+        """A progress display for ``total`` steps; ``costs`` are their relative costs, equal if None."""
+        progress = Progress(total, f"{self.stage}:{self.subject} {label}", costs)
         try:
             yield progress
         finally:

@@ -35,6 +35,7 @@ from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
 from stages.train.score_picture import score_picture
 from stages.train.settings import TrainSettings
+from stages.train.step_costs import step_costs
 from stages.train.timer import TrainingTimer
 from stages.train.visibility_gate import VisibilityGate, ever_in_frame, write_ungated
 
@@ -231,8 +232,8 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
     if trainer.untrained is None:
         with timer.paused():
             trainer.untrained = trainer.held_out(inputs.whole, watched)
-    with context.progress(settings.iterations, "training") as progress:
-        progress.advance(trainer.iteration)
+    with context.progress(settings.iterations, "training", step_costs(trainer)) as progress:
+        progress.skip(trainer.iteration)
         while trainer.iteration < settings.iterations:
             values = trainer.step()
             last = trainer.iteration == settings.iterations

@@ -33,6 +33,13 @@ def test_pipeline_never_imports_stages():
         assert not [name for name in imports(path) if name.split(".")[0] == "stages"], path
 
 
+def test_only_the_dag_imports_studies():
+    for folder in ("pipeline", "stages", "benchmarks", "tools"):
+        for path in sources(folder):
+            others = [name for name in imports(path) if name.startswith("pipeline.studies")]
+            assert not others or path.parent.name == "studies", path
+
+
 def test_no_stage_imports_another():
     for path in sources("stages"):
         own = path.relative_to(REPOSITORY / "stages").parts[0]
@@ -46,7 +53,7 @@ def test_a_stage_is_declared_by_the_name_of_its_folder():
 
 
 def test_the_dag_loads_nothing_heavy():
-    heavy = ("torch", "numpy", "cv2", "numba", "pyarrow", "scipy")
+    heavy = ("torch", "numpy", "cv2", "numba", "pyarrow", "scipy", "pandas", "matplotlib")
     code = f"import sys, dodo; print([name for name in {heavy} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
