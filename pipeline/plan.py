@@ -17,7 +17,8 @@ from typing import Any, get_args
 
 from pipeline.config.choices import BodyPart
 from pipeline.errors import UserError
-from pipeline.records import read_json, write_json
+from pipeline.json_files import write_json
+from pipeline.records import read_json
 
 GATHERED = ("structure_from_motion", "face_registration")
 """Decided by ingest and by fit, which publish what the plan needs to know of it."""

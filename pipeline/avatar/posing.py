@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
-from pipeline.avatar.fused import use_torch_threads
-from pipeline.avatar.fused_kernels import CHUNKS, FAST
+from pipeline.avatar.fused_kernels import CHUNKS
 from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
+from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads
 
 
 def joints_of_points(skinning_weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,7 +130,7 @@ def _blended(rig: Rig, transforms: Tensor) -> Tensor:
     return blend_transforms(transforms, weights)
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _blend(transforms, joints, weights, point, blended):
     for k in range(12):
         blended[k] = 0
@@ -140,7 +140,7 @@ def _blend(transforms, joints, weights, point, blended):
             blended[k] += weight * transforms[joint, k]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def skin_points(transforms, joints, weights, points, posed):
     """Rest points carried to their pose.
 
@@ -163,7 +163,7 @@ def skin_points(transforms, joints, weights, points, posed):
                 posed[i, row] = value
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def normals_of_vertices(vertices, faces, starts, around, normals):
     """Unit normals, area-weighted over the faces around each vertex, as ``pipeline.body.vertex_normals``.
 
@@ -192,7 +192,7 @@ def normals_of_vertices(vertices, faces, starts, around, normals):
             normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _write_quaternion(m, quaternion):
     """A nearly orthonormal matrix [3, 3] as a unit quaternion, wxyz, by the largest of its parts."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -215,7 +215,7 @@ def _write_quaternion(m, quaternion):
         quaternion[k] /= np.sqrt(square)
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def place_gaussians(transforms, joints, weights, points, frames, transl, means, quaternions):
     """Centres and orientations of the Gaussians in the world.
 

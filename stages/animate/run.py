@@ -16,13 +16,14 @@ from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_jo
 from pipeline.camera import Camera
 from pipeline.composite import over, to_bytes
 from pipeline.frames import write_png, write_video
+from pipeline.json_files import write_json
 from pipeline.motion.names import TURNTABLE, motion_name
 from pipeline.motion.place import place
 from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
 from pipeline.motion.record import Span
 from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
-from pipeline.records import read_cameras, read_split, write_cameras, write_json
+from pipeline.records import read_cameras, read_split, write_cameras
 from pipeline.splat import Gaussians, Rendering, render, write_ply
 from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context

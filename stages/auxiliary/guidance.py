@@ -21,9 +21,10 @@ import numpy as np
 from pipeline.body import write_poses
 from pipeline.clip import FittedClip
 from pipeline.frames import frame_path, write_png
+from pipeline.json_files import write_json
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import write_cameras, write_json
+from pipeline.records import write_cameras
 from stages.auxiliary.reference import Reference
 from stages.auxiliary.skeleton import draw_skeleton
 from stages.auxiliary.turn import Turn

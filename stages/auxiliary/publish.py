@@ -14,9 +14,10 @@ from pipeline.camera import Camera
 from pipeline.clip import FittedClip
 from pipeline.composite import composite
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.json_files import write_json
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.pictures import side_by_side
-from pipeline.records import write_cameras, write_json
+from pipeline.records import write_cameras
 from pipeline.spread import spread_from_start
 from stages.auxiliary.accept import Accepted
 from stages.auxiliary.crop import Framing, crop

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from pipeline.curves import Curve
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters

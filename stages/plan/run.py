@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from pipeline.numba_kernels import threads
 from pipeline.plan import write_plan
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.plan.decide import decide
 from stages.plan.measure import read_inputs
 

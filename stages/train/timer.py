@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compiling import CompileTimer
+from pipeline.json_files import write_json
 
 NAME = "timer.json"
 
@@ -76,7 +77,7 @@ class TrainingTimer:
     def save(self, iteration: int) -> None:
         """Stores the marks beside a checkpoint that has just been written."""
         state = {"earlier": self.now(iteration), "marks": self.marks}
-        self._file.write_text(json.dumps(state), encoding="utf-8")
+        write_json(self._file, state)
 
     def summary(self, first: int, last: int) -> dict[str, Any]:
         """The seconds of all iterations and of each of this process's, for run.json.

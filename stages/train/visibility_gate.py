@@ -33,7 +33,7 @@ from pipeline.avatar.canonical import dilate
 from pipeline.body import Pose
 from pipeline.clip import View, ViewCache
 from pipeline.device import moved
-from pipeline.records import write_json
+from pipeline.json_files import write_json
 from pipeline.tables import write_table
 from pipeline.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
 from stages.train.hooks import Hook

@@ -10,9 +10,10 @@ import torch
 from pipeline.camera import facing_camera
 from pipeline.clip import read_fitted_clip
 from pipeline.errors import UserError
+from pipeline.json_files import write_json
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
-from pipeline.records import Split, read_footage, write_footage, write_json, write_split
+from pipeline.records import Split, read_footage, write_footage, write_split
 from pipeline.settings import command_line_layer, resolve
 from pipeline.tables import write_table
 from stages.ingest.cameras.motion import MOVING

@@ -10,7 +10,8 @@ from pipeline.body import Poses, read_poses, write_poses
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask
-from pipeline.records import read_cameras, write_cameras, write_json
+from pipeline.json_files import write_json
+from pipeline.records import read_cameras, write_cameras
 from pipeline.tables import read_table
 from stages.train import run as stage
 from stages.train.generated import GeneratedFrames, read_generated

@@ -7,7 +7,7 @@ from pipeline.workspace import REPOSITORY
 
 PROGRAM = """
 import torch
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from pipeline.avatar.heads import Head
 with threads(1):
     Head(4, 2, width=8, groups=2)(torch.ones(4, 4))  # numba's first parallel kernel
