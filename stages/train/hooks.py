@@ -15,6 +15,9 @@ from stages.train.timer import TrainingTimer
 if TYPE_CHECKING:
     from stages.train.loop import Trainer
 
+Log = Callable[[str], None]
+"""Writes one line to the terminal."""
+
 
 class Hook:
     """A hook that does nothing; each of its methods is called by the trainer.
@@ -92,7 +95,3 @@ class ProgressBar(Hook):
 def describe(terms: dict[str, float]) -> str:
     """The objective's value in words."""
     return f"loss {sum(terms.values()):.4f}"
-
-
-Log = Callable[[str], None]
-"""Writes one line to the terminal."""

@@ -81,14 +81,15 @@ class Term(Generic[Source]):
 
     def part_weights(self, settings: TrainSettings) -> PartWeights:
         """The weights on hands, face and elsewhere."""
-        return tuple(getattr(settings, name or self.weight) for name in (self.hands, self.face, ""))
+        hands, face = (getattr(settings, name or self.weight) for name in (self.hands, self.face))
+        return hands, face, getattr(settings, self.weight)
 
     def scalar_weight(self, settings: TrainSettings, generated: bool) -> float:
         """The factor of its weighted mean; 1 where vertices have weights of their own."""
         if self.by_part:
             return 1.0
-        name = self.generated if generated and self.generated else self.weight
-        return getattr(settings, name) * (getattr(settings, self.every) if self.every else 1)
+        weight: float = getattr(settings, self.generated if generated and self.generated else self.weight)
+        return weight * getattr(settings, self.every) if self.every else weight
 
     def first_iteration(self, settings: TrainSettings) -> int | None:
         """The first iteration that it takes part in; None where it has no weight or never begins."""
@@ -108,7 +109,7 @@ class Term(Generic[Source]):
         first = self.first_iteration(settings)
         if first is None or iteration < first or (self.captured_only and generated):
             return False
-        return not self.every or position % getattr(settings, self.every) == 0
+        return not self.every or position % int(getattr(settings, self.every)) == 0
 
 
 # fmt: off
@@ -149,12 +150,13 @@ STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
          lambda s: (s.regions.on_hands(s.decoded.offset), s.regions.on_hands(s.normals)), "hand_normal"),
 )
 # fmt: on
+TERMS: tuple[Term[Any], ...] = (*FRAME_TERMS, *STATIC_TERMS)
 
 
 def describe_objective(settings: TrainSettings) -> str:
     """The terms that take part, each with its weights and first iteration: a line for the log."""
     found = []
-    for term in (*FRAME_TERMS, *STATIC_TERMS):
+    for term in TERMS:
         first = term.first_iteration(settings)
         if first is not None:
             weights = "/".join(f"{getattr(settings, name):g}" for name in term.weights)
@@ -280,11 +282,7 @@ class Objective:
     def _regions(self, surface: Surface) -> Regions:
         """The regions of a surface, computed once until another takes its place."""
         if self._last_regions is None or self._last_regions[0] is not surface:
-            by_part = {
-                term.name: term.part_weights(self.settings)
-                for term in (*FRAME_TERMS, *STATIC_TERMS)
-                if term.by_part
-            }
+            by_part = {term.name: term.part_weights(self.settings) for term in TERMS if term.by_part}
             arms = bool(self.settings.arm_color)
             self._last_regions = surface, find_regions(surface.canonical, by_part, arms)
         return self._last_regions[1]

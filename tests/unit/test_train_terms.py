@@ -9,6 +9,7 @@ import torch
 from pipeline.avatar import build_canonical
 from pipeline.body import load_body, mean_identity
 from pipeline.camera import facing_camera
+from pipeline.settings import Weight
 from pipeline.workspace import REPOSITORY
 from stages.train import STAGE, losses, objective, regularisers
 from stages.train.face import Pasted, face_triangles, paste
@@ -135,7 +136,7 @@ def test_face_triangles_are_those_of_the_face(canonical):
 
 def test_weights_follow_the_parts(canonical):
     settings = TrainSettings(offset=1.0, offset_hands=2.0, offset_face=3.0, laplacian_color_hands=4.0)
-    terms = {term.name: term for term in (*objective.FRAME_TERMS, *objective.STATIC_TERMS)}
+    terms = {term.name: term for term in objective.TERMS}
     weights = {
         name: regularisers.weight_by_part(canonical, *terms[name].part_weights(settings))
         for name in ("offset", "laplacian_color")
@@ -165,3 +166,40 @@ def test_undersides_lie_below_what_they_are_paired_with(canonical):
 def test_lpips_is_asked_for_only_where_it_has_a_weight():
     assert STAGE.demands(TrainSettings(lpips=0.0)).assets == ()
     assert STAGE.demands(TrainSettings(lpips=0.2)).assets == ("lpips",)
+
+
+def test_every_weight_of_the_settings_weighs_a_term():
+    named = {name for term in objective.TERMS for name in (*term.weights, term.generated) if name}
+    weights = {field.name for field in dataclasses.fields(TrainSettings) if field.type in ("Weight", Weight)}
+    assert named == weights and len({term.name for term in objective.TERMS}) == len(objective.TERMS)
+
+
+def test_terms_take_part_from_their_iteration_on_and_in_every_kth_draw():
+    settings = TrainSettings(iterations=10, lpips=0.2, lpips_every=3, lpips_from=0.25, pose_heads_from=1.0)
+    terms = {term.name: term for term in objective.TERMS}
+    lpips = terms["lpips"]
+    assert [lpips.takes_part(settings, 3, position, False) for position in range(4)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
+    assert [lpips.takes_part(settings, iteration, 0, False) for iteration in (0, 2, 3)] == [
+        False,
+        False,
+        True,
+    ]
+    assert lpips.scalar_weight(settings, False) == pytest.approx(0.6)
+    assert lpips.scalar_weight(settings, True) == pytest.approx(3 * settings.generated)
+    assert terms["pose_offset"].first_iteration(settings) is None  # 1 stands for never
+    assert terms["hand_normal"].first_iteration(settings) is None  # no weight
+    weighted = TrainSettings(face=0.8)
+    assert [terms["face"].takes_part(weighted, 0, 0, generated) for generated in (False, True)] == [
+        True,
+        False,
+    ]
+
+
+def test_the_log_names_what_takes_part_with_its_weights():
+    line = objective.describe_objective(TrainSettings(iterations=10, l1=0.7, pose_heads_from=0.35, lpips=0.0))
+    assert "l1 0.7, ssim 0.2" in line and "pose_offset 50 from iteration 4" in line and "lpips" not in line
