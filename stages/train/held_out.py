@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from pipeline.curves import Curve
+from pipeline.clip.curves import Curve
 from pipeline.device import moved
 from pipeline.errors import UserError
 from pipeline.metrics.psnr import psnr

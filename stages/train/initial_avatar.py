@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.clip.spread import spread_from_start
 from pipeline.errors import UserError
-from pipeline.spread import spread_from_start
 from stages.train.data import TrainingData
 from stages.train.initial_colors import initial_color_logits
 from stages.train.poses import PoseRefinement

@@ -10,7 +10,7 @@ import torch
 from pipeline.avatar import Avatar
 from pipeline.body import Pose
 from pipeline.clip import View
-from pipeline.guard import NotFiniteError, finite, require_finite
+from pipeline.finite import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore

@@ -10,9 +10,9 @@ import torch
 
 from pipeline.avatar import save_avatar
 from pipeline.body import BodyModel, Identity, draw_mesh, rest_vertices, write_poses
-from pipeline.camera import facing_camera
-from pipeline.curves import Curve
-from pipeline.frames import write_png
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.curves import Curve
+from pipeline.clip.frames import write_png
 from stages.train.initial_colors import color_unseen
 from stages.train.loop import Trainer
 from stages.train.visibility_gate import VisibilityGate, write_ungated

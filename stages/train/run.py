@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
-from pipeline.compiling import CompileTimer, compile_timer
+from pipeline.clip.plan import read_plan
+from pipeline.config.settings import as_dict
 from pipeline.device import moved, resolve
 from pipeline.metrics import Lpips
 from pipeline.numba_kernels import threads
-from pipeline.plan import read_plan
-from pipeline.settings import as_dict
-from pipeline.stage import Context
+from pipeline.run.compile_timer import CompileTimer, compile_timer
+from pipeline.run.stage import Context
 from stages.train.checkpoint import NAME, read_checkpoint, run_key
 from stages.train.data import TrainingData, read_training_data
 from stages.train.held_out import WATCHED, HeldOutCurve

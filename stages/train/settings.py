@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from pipeline.config.choices import Device, LpipsNetwork, ResidualPart, ResidualPlace
-from pipeline.settings import (
+from pipeline.config.settings import (
     SETTINGS,
     Count,
     CountOrNone,
@@ -22,7 +22,7 @@ from pipeline.settings import (
 )  # fmt: skip
 
 if TYPE_CHECKING:  # settings are read by what must start quickly
-    from pipeline.plan import Plan
+    from pipeline.clip.plan import Plan
 
 Batch = Annotated[int, Field(ge=1, le=10_000)]
 Threads = Annotated[int, Field(ge=0, le=1024)]

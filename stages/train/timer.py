@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.compiling import CompileTimer
-from pipeline.json_files import write_json
+from pipeline.files.json_files import write_json
+from pipeline.run.compile_timer import CompileTimer
 
 NAME = "timer.json"
 

@@ -5,14 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline import curves
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
-from pipeline.clip import read_fitted_clip
+from pipeline.clip import curves, read_fitted_clip
 from pipeline.errors import UserError
+from pipeline.files.tables import read_table
 from pipeline.splat import render
-from pipeline.tables import read_table
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
 from stages.train.held_out import held_out_psnr

@@ -8,7 +8,7 @@ from torch import nn
 
 from pipeline.avatar import Avatar
 from pipeline.clip import ViewCache
-from pipeline.records import Split
+from pipeline.clip.records import Split
 from stages.train.data import TrainingData
 from stages.train.initial_avatar import initial_avatar
 from stages.train.objective import Objective

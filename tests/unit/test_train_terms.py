@@ -8,9 +8,9 @@ import torch
 
 from pipeline.avatar import build_canonical
 from pipeline.body import load_body, mean_identity
-from pipeline.camera import facing_camera
-from pipeline.settings import Weight
-from pipeline.workspace import REPOSITORY
+from pipeline.clip.camera import facing_camera
+from pipeline.config.settings import Weight
+from pipeline.config.workspace import REPOSITORY
 from stages.train import STAGE, losses, objective, regularisers
 from stages.train.face import Pasted, face_triangles, paste
 from stages.train.losses import person_crop

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pipeline.avatar.fused_kernels import (
+from pipeline.avatar.head_kernels import (
     CHUNKS,
     bits,
     lanes_of,

@@ -21,11 +21,12 @@ from typing import Any
 
 import filelock
 
-from pipeline import digest, seal
+from pipeline.error_messages import is_disk_full
 from pipeline.errors import UserError
-from pipeline.explain import is_disk_full
-from pipeline.guard import require_finite_files
-from pipeline.json_files import write_json
+from pipeline.files.json_files import write_json
+from pipeline.finite import require_finite_files
+from pipeline.store import digest
+from pipeline.store import record_digests as seal
 
 MANIFEST = "manifest.json"
 RUN = "run.json"

@@ -23,10 +23,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.datasets import load_dataset
+from pipeline.config.datasets import load_dataset
+from pipeline.config.settings import Layer, near, read_toml
+from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
-from pipeline.settings import Layer, near, read_toml
-from pipeline.workspace import Workspace
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from pipeline.body import JOINT_NAMES, BodyModel
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.motion.legs import leg_of
-from pipeline.motion.record import MOST_FRAMES, USUAL_FPS, Motion, Span
+from pipeline.motion.motion import MOST_FRAMES, USUAL_FPS, Motion, Span
 from pipeline.pose_files import InitialPoses, into_world, on_frames, read_known_poses, with_flat_hands
 from pipeline.pose_files.coefficients import is_official_smplx, knows_coefficients
 

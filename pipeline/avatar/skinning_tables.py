@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
-from pipeline.avatar.fused_kernels import CHUNKS
+from pipeline.avatar.head_kernels import CHUNKS
 from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
 from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads

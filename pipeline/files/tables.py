@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import UserError
-from pipeline.guard import NotFiniteError
+from pipeline.finite import NotFiniteError
 
 MOST_BYTES = 4 << 30  # an hour of keypoints unpacks to half of it
 

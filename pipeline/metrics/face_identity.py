@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pipeline.boxes import Box
+from pipeline.clip.boxes import Box
 from pipeline.errors import UserError
 
 ASSETS = ("dlib", "identity")

@@ -13,11 +13,11 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pipeline.artifact import Artifact
 from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.job import Job
-from pipeline.stage import usual
+from pipeline.run.job import Job
+from pipeline.run.stage import usual
+from pipeline.store.artifact import Artifact
 
 REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""

@@ -28,7 +28,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import UserError
-from pipeline.tables import read_table, vectors, write_table
+from pipeline.files.tables import read_table, vectors, write_table
 
 BODY = slice(0, 17)
 FEET = slice(17, 23)

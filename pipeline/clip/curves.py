@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from pipeline.tables import read_table, write_table
+from pipeline.files.tables import read_table, write_table
 
 SCHEMA = pa.schema([("iteration", pa.int32()), ("name", pa.string()), ("value", pa.float32())])
 

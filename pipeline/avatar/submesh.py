@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical, faces_among
-from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region
+from pipeline.avatar.skinning_tables import Rig
 from pipeline.avatar.surface import Surface
 from pipeline.body import subdivide
 

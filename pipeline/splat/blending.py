@@ -23,7 +23,7 @@ from numba import prange, types
 from numba.extending import overload
 
 from pipeline.numba_kernels import kernel, parallel_kernel
-from pipeline.splat import constants
+from pipeline.splat import image_formation as constants
 from pipeline.splat.tiles import TILE
 
 _PIXELS = TILE * TILE

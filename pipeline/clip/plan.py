@@ -15,10 +15,10 @@ import math
 from pathlib import Path
 from typing import Any, get_args
 
+from pipeline.clip.records import read_json
 from pipeline.config.choices import BodyPart
 from pipeline.errors import UserError
-from pipeline.json_files import write_json
-from pipeline.records import read_json
+from pipeline.files.json_files import write_json
 
 GATHERED = ("structure_from_motion", "face_registration")
 """Decided by ingest and by fit, which publish what the plan needs to know of it."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline import digest
+from pipeline.store import digest
 
 SEAL = "SHA256SUMS"
 

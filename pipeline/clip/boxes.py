@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.clip.frames import read_mask
 from pipeline.errors import UserError
-from pipeline.frames import read_mask
 
 FAINTEST = 8  # of 255: alpha under this is taken for noise when a clip's box is sought
 SMALLEST = 11  # pixels along a side of a clip's box: the window of SSIM, which it is compared with

@@ -10,11 +10,11 @@ import numpy as np
 import roma
 
 from pipeline.body import JOINT_NAMES, BodyModel, read_identity, read_poses, rest_joints
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.records import read_cameras, read_footage
 from pipeline.errors import UserError
 from pipeline.motion.legs import leg_of
-from pipeline.motion.record import USUAL_FPS, Motion, Span
-from pipeline.records import read_cameras, read_footage
+from pipeline.motion.motion import USUAL_FPS, Motion, Span
 
 READ = {
     "ingest": ("footage.json", "cameras.parquet"),

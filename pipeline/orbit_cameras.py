@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.splat import Gaussians
 
 _FIELD = math.radians(25)  # of view, along the image's height; a long lens, as portraits are taken

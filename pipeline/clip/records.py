@@ -2,7 +2,7 @@
 
 ``cameras.parquet`` has one row a kept frame: ``frame``, ``width``, ``height`` (int32, pixels),
 ``intrinsics`` [9] and ``rotation`` [9] (float64, row by row) and ``translation`` [3] (float64, metres),
-world-to-camera with OpenCV axes as in :mod:`pipeline.camera`.
+world-to-camera with OpenCV axes as in :mod:`pipeline.clip.camera`.
 ``split.json`` is ``{"train": [...], "test": [...]}``, frame numbers.
 ``footage.json`` holds the fields of :class:`Footage`.
 """
@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 import torch
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
-from pipeline.json_files import write_json
-from pipeline.tables import read_table, vectors, write_table
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import read_table, vectors, write_table
 from pipeline.untrusted import parse_json
 
 CAMERA_SCHEMA = pa.schema(

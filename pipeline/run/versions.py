@@ -7,7 +7,7 @@ import platform
 import subprocess
 import tomllib
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 PACKAGES = (
     "torch",

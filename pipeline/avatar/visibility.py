@@ -28,7 +28,7 @@ from torch import Tensor
 
 from pipeline.avatar import Surface
 from pipeline.body import Pose, joint_transforms
-from pipeline.camera import Camera, project, to_camera
+from pipeline.clip.camera import Camera, project, to_camera
 
 BINS = 256
 NEAR = 0.2  # metres: what is nearer to the camera is not in the picture, as in the authors' release

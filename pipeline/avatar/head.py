@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from pipeline.avatar.fused import Layers, decode
-from pipeline.avatar.fused_kernels import EPSILON
+from pipeline.avatar.fused_head import Layers, decode
+from pipeline.avatar.head_kernels import EPSILON
 from pipeline.device import autocast, kernels_serve
 
 

@@ -14,15 +14,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline import assets as third_party
-from pipeline import digest
-from pipeline.artifact import Artifact, Store, clear
+from pipeline.config import assets as third_party
 from pipeline.config.request import Request
+from pipeline.config.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
+from pipeline.config.subjects import Subject, load_subject, require_footage
+from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
-from pipeline.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
-from pipeline.stage import Context, Loan, Stage, load_stages
-from pipeline.subjects import Subject, load_subject, require_footage
-from pipeline.workspace import Workspace
+from pipeline.run.stage import Context, Loan, Stage, load_stages
+from pipeline.store import digest
+from pipeline.store.artifact import Artifact, Store, clear
 
 NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
 

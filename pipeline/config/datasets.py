@@ -23,9 +23,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.config.settings import Layer, near, read_toml
+from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
-from pipeline.settings import Layer, near, read_toml
-from pipeline.workspace import Workspace
 
 OWN = ("title", "obtain", "protocol", "paper")
 """What a dataset's file holds besides settings."""

@@ -7,9 +7,9 @@ import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from pipeline.artifact import MANIFEST, Artifact, Store, damaged_files, read_manifest
 from pipeline.config.request import Request
 from pipeline.errors import UserError
+from pipeline.store.artifact import MANIFEST, Artifact, Store, damaged_files, read_manifest
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.guard import NotFiniteError, not_finite_in
+from pipeline.finite import NotFiniteError, not_finite_in
 
 
 def write_json(path: Path, value: Any) -> None:

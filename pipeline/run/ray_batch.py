@@ -24,15 +24,15 @@ from typing import Any
 
 from pydantic.dataclasses import dataclass
 
-from pipeline import assets as third_party
+from pipeline.config import assets as third_party
 from pipeline.config.request import Processors, Request
+from pipeline.config.settings import SETTINGS, read_fields, read_toml
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.job import Job, open_job, preset_path
-from pipeline.process import run_stage_process
-from pipeline.settings import SETTINGS, read_fields, read_toml
-from pipeline.stage import Stage, usual
-from pipeline.summary import Outcome, summary_lines
-from pipeline.workspace import REPOSITORY
+from pipeline.run.doit_reporter import Outcome, summary_lines
+from pipeline.run.job import Job, open_job, preset_path
+from pipeline.run.process import run_stage_process
+from pipeline.run.stage import Stage, usual
 
 RETRIES = 5  # how often a subject is begun again because its machine was lost
 WAIT_SECONDS = 10.0  # between lines that say what is still running

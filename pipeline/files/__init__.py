@@ -1,0 +1,1 @@
+"""Files of plain tables and JSON."""
