@@ -17,22 +17,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.boxes import Box
-from pipeline.composite import BACKGROUNDS, BLACK, WHITE, cut_out, to_bytes
-from pipeline.guard import require_finite
-from pipeline.metrics.identity import Face, identity_cosine, identity_distance
+from pipeline.clip.boxes import Box
+from pipeline.clip.composite import BACKGROUNDS, BLACK, WHITE, cut_out, to_bytes
+from pipeline.config.evaluation_protocol import OWN, TRUTH
+from pipeline.finite import require_finite
+from pipeline.metrics.face_identity import Face, identity_cosine, identity_distance
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.protocol import interior, person
+from pipeline.metrics.person_pixels import interior, person
 from pipeline.metrics.psnr import psnr
 from pipeline.metrics.ssim import ssim
-from pipeline.protocols import OWN, TRUTH
 from stages.evaluate.methods import OnBackground
 
 FACE_MARGIN = 0.5  # of the face crop's size, around it, for the face finder
 
 
 class FaceEmbedder(Protocol):
-    """Finds and embeds a face; :class:`pipeline.metrics.identity.FaceReader` is one."""
+    """Finds and embeds a face; :class:`pipeline.metrics.face_identity.FaceReader` is one."""
 
     def read(self, image: np.ndarray, box: Box | None = None) -> Face | None:
         """The face in [H, W, 3] uint8 RGB, or None."""
@@ -116,7 +116,7 @@ class Scorer:
         Args:
             picture: what is scored.
             truth: the person.
-            interior: [H, W] bool, see :func:`pipeline.metrics.protocol.interior`.
+            interior: [H, W] bool, see :func:`pipeline.metrics.person_pixels.interior`.
             person: [H, W] bool, the person's pixels; without ``psnr_person`` if None.
 
         Returns:

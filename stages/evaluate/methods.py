@@ -17,8 +17,8 @@ from torch import Tensor
 from pipeline.avatar import Avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import Pose
-from pipeline.camera import Camera
-from pipeline.composite import BLACK, over
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import BLACK, over
 from pipeline.splat import Gaussians, Rendering, render
 from stages.evaluate.evaluated_clip import EvaluatedClip
 

@@ -29,14 +29,14 @@ from pipeline.body import (
     read_poses,
 )
 from pipeline.body.mesh import Raster
-from pipeline.camera import Camera
-from pipeline.composite import BACKGROUNDS, BLACK, composite_frame
-from pipeline.frames import read_frame, read_mask
-from pipeline.metrics.protocol import interior, person
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.records import read_cameras
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.metrics.person_pixels import interior, person
 from pipeline.metrics.psnr import psnr
 from pipeline.metrics.ssim import ssim
-from pipeline.records import read_cameras
-from pipeline.spread import spread_end_to_end
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import AvatarMethod, OnBackground
 from stages.evaluate.scores import VIEWS, TableRow

@@ -11,23 +11,23 @@ import numpy as np
 import pandas as pd
 import torch
 
-from pipeline import artifact
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose
-from pipeline.curves import read_curve
-from pipeline.frames import write_png, write_video
-from pipeline.job import peak_memory, shown
+from pipeline.clip.curves import read_curve
+from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.plan import EFFECTS, Plan, read_plan
+from pipeline.clip.records import write_json
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.config.settings import as_dict
 from pipeline.metrics import Lpips
-from pipeline.metrics.identity import FaceReader
+from pipeline.metrics.face_identity import FaceReader
+from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
-from pipeline.plan import EFFECTS, Plan, read_plan
-from pipeline.records import write_json
-from pipeline.settings import as_dict
+from pipeline.run.job import peak_memory, shown
+from pipeline.run.stage import Context
+from pipeline.run.versions import versions
 from pipeline.splat import Gaussians, write_ply
-from pipeline.spread import spread_end_to_end
-from pipeline.stage import Context
-from pipeline.turntable import orbit, relaxed_pose, visible_extent
-from pipeline.versions import versions
+from pipeline.store import artifact
 from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip

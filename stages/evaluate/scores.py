@@ -11,10 +11,10 @@ import pandas as pd
 import pyarrow as pa
 from torch import Tensor
 
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.files.tables import write_table
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.regions import region_boxes
-from pipeline.spread import spread_end_to_end
-from pipeline.tables import write_table
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.frame_metrics import (
     FaceEmbedder,

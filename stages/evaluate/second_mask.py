@@ -22,16 +22,16 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.composite import composite_frame
-from pipeline.detection.estimator import Estimator, estimator_scale, resize
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.detection.mediapipe import Estimator, estimator_scale, resize
 from pipeline.errors import UserError
-from pipeline.spread import spread_end_to_end
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import CEILING, OnBackground
 from stages.evaluate.settings import EvaluateSettings
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 SHORT_SIDE, LONG_SIDE = 400, 1920  # pixels that the estimator is shown, as by ingest's defaults
 _SEGMENTATIONS = ("body_mask", "selfie_mask")

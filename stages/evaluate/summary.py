@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.config.evaluation_protocol import PROTOCOLS, TRUTH, Protocol
 from pipeline.metrics import EROSION
-from pipeline.protocols import PROTOCOLS, TRUTH, Protocol
-from pipeline.stage import Context
+from pipeline.run.stage import Context
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.second_mask import SecondMask

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from pipeline.body import Pose, Poses, write_poses
-from pipeline.composite import BACKGROUNDS, over
+from pipeline.clip.composite import BACKGROUNDS, over
+from pipeline.clip.plan import Plan
+from pipeline.config.evaluation_protocol import ON, PLAN
 from pipeline.metrics.ssim import rounded_gaussian_window, ssim_loss
-from pipeline.plan import Plan
-from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import Animate

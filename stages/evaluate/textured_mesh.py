@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.camera import Camera
-from pipeline.composite import composite_frame
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import composite_frame
 from pipeline.texture import FineSurface, fine_surface, gather, paint
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import MESH, OnBackground

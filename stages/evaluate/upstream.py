@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.artifact import MANIFEST, RUN
+from pipeline.clip.records import read_json
 from pipeline.errors import UserError
-from pipeline.records import read_json
-from pipeline.tables import read_table
+from pipeline.files.tables import read_table
+from pipeline.store.artifact import MANIFEST, RUN
 
 VISIBILITY = pa.schema([("captured", pa.float32()), ("kept", pa.bool_())])
 """The columns of train's visibility.parquet that are read: each body vertex's score, and whether it carries

@@ -17,7 +17,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.plan import AZIMUTH_STEP
+from pipeline.clip.plan import AZIMUTH_STEP
 from stages.evaluate.methods import AVATAR, BASELINES, CEILING, MESH, NEAREST, REFINED
 from stages.evaluate.scores import HELD_OUT, TRAINING
 

@@ -8,8 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.compiling import CompileTimer
-from pipeline.json_files import write_json
+from pipeline.files.json_files import write_json
+from pipeline.run.compile_timer import CompileTimer
 
 NAME = "timer.json"
 

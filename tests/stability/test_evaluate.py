@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints, read_keypoints, write_keypoints
+from pipeline.clip.plan import EFFECTS, read_plan
+from pipeline.clip.records import Split, write_split
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import empty_keypoints, read_keypoints, write_keypoints
-from pipeline.plan import EFFECTS, read_plan
-from pipeline.records import Split, write_split
+from pipeline.files.tables import write_table
+from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.splat import Gaussians, render
-from pipeline.tables import write_table
-from pipeline.turntable import orbit, visible_extent
 from stages.plan import measure
 from stages.plan.run import run as run_plan
 from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, stand_in

@@ -8,16 +8,16 @@ import numpy as np
 import torch
 
 from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
-from pipeline.camera import facing_camera
-from pipeline.curves import Curve
-from pipeline.frames import write_frame, write_mask
-from pipeline.json_files import write_json
-from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
-from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.curves import Curve
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
+from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, render
-from pipeline.stage import Context
-from pipeline.tables import write_table
 from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.run import evaluate

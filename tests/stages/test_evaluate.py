@@ -10,13 +10,13 @@ import torch
 from rich.console import Console
 
 from pipeline.body import Pose, Poses, write_poses
-from pipeline.curves import read_curve
+from pipeline.clip.curves import read_curve
+from pipeline.clip.frames import write_mask, write_png
+from pipeline.clip.spread import spread_end_to_end
 from pipeline.errors import UserError
-from pipeline.frames import write_mask, write_png
 from pipeline.metrics import PSNR_CAP
+from pipeline.orbit_cameras import relaxed_pose
 from pipeline.splat import read_ply
-from pipeline.spread import spread_end_to_end
-from pipeline.turntable import relaxed_pose
 from stages.evaluate import STAGE
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.report.plots import plot_training, plot_visibility

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.frames import write_png
+from pipeline.clip.frames import write_png
 from stages.evaluate.scores import TableRow
 from stages.evaluate.second_mask import SecondMask, edge
 from tests.stages.evaluate_subject import TEST, make_clip

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from pipeline.body import load_body, write_identity, write_poses
-from pipeline.camera import Camera
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.records import write_cameras
 from pipeline.metrics import interior, psnr
-from pipeline.records import write_cameras
 from pipeline.splat import render
 from stages.evaluate.baselines import mean_frame
 from stages.evaluate.evaluated_clip import read_evaluated_clip

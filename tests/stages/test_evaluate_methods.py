@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from pipeline.body import Poses, write_poses
+from pipeline.clip.frames import read_mask
+from pipeline.clip.records import read_cameras, write_cameras
 from pipeline.errors import UserError
-from pipeline.frames import read_mask
-from pipeline.metrics.identity import Face
-from pipeline.records import read_cameras, write_cameras
+from pipeline.metrics.face_identity import Face
 from stages.evaluate import statistics
 from stages.evaluate.report.tables import camera_table
 from stages.evaluate.scores import TableRow, score_table

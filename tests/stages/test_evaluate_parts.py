@@ -6,10 +6,10 @@ import roma
 import torch
 
 from pipeline.body import Pose
-from pipeline.camera import project, to_camera
+from pipeline.clip.camera import project, to_camera
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.orbit_cameras import Extent, orbit, relaxed_pose, visible_extent
 from pipeline.splat import Gaussians
-from pipeline.spread import spread_end_to_end
-from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.baselines import mean_frame, nearest_frames
 from stages.evaluate.report.pictures import compare, comparison_sheet, person_box
 from stages.evaluate.report.videos import turntable_pictures

@@ -12,13 +12,13 @@ import torch
 from rich.console import Console
 
 from pipeline.body import Pose, read_poses, write_poses
-from pipeline.camera import project
-from pipeline.frames import read_mask, write_mask
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.camera import project
+from pipeline.clip.frames import read_mask, write_mask
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import read_cameras
+from pipeline.config.evaluation_protocol import PROTOCOLS
 from pipeline.metrics import psnr
-from pipeline.plan import write_plan
-from pipeline.protocols import PROTOCOLS
-from pipeline.records import read_cameras
 from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.methods import AVATAR, AvatarMethod, pose_gradient_animation
 from stages.evaluate.report.terminal import show_summary

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.turntable import relaxed_pose
-from pipeline.versions import PACKAGES, commit, package_version, versions
+from pipeline.orbit_cameras import relaxed_pose
+from pipeline.run.versions import PACKAGES, commit, package_version, versions
 from stages.evaluate.report.videos import motion_pictures, motion_poses
 from stages.evaluate.verdict import ClipCoverage, limits, quality, turned, verdict
 from tests.stages.evaluate_subject import stand_in

@@ -8,14 +8,14 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import bake
-from pipeline.avatar.fused import Layers, decode
-from pipeline.avatar.heads import Head
-from pipeline.avatar.posing import faces_of_vertices, joints_of_points, normals_of_vertices
+from pipeline.avatar.fused_head import Layers, decode
+from pipeline.avatar.head import Head
+from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points, normals_of_vertices
 from pipeline.body import Pose, load_body, mean_identity, vertex_normals
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.config.workspace import REPOSITORY
 from pipeline.numba_kernels import threads
 from pipeline.splat import render
-from pipeline.workspace import REPOSITORY
 from stages.evaluate.methods import baked_animation
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=16, groups=2, subdivisions=1)

@@ -6,10 +6,10 @@ import dataclasses
 
 import pandas as pd
 
+from pipeline.clip.plan import Plan
+from pipeline.clip.records import Footage, Split
+from pipeline.config.evaluation_protocol import PLAN
 from pipeline.metrics.lpips import NETWORKS
-from pipeline.plan import Plan
-from pipeline.protocols import PLAN
-from pipeline.records import Footage, Split
 from stages.evaluate.scores import HELD_OUT, TRAINING
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.test_pose_refinement import EFFECT, RefinedTestPoses

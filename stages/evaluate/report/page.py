@@ -13,7 +13,7 @@ import cv2
 import jinja2
 import numpy as np
 
-from pipeline.plan import Decision
+from pipeline.clip.plan import Decision
 from stages.evaluate.report import tables
 from stages.evaluate.report.omissions import Omission
 from stages.evaluate.report.pictures import Closeup, Comparison

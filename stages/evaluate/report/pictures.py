@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.boxes import Box, person_box
-from pipeline.composite import to_bytes
+from pipeline.clip.boxes import Box, person_box
+from pipeline.clip.composite import to_bytes
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.pictures import caption, resized, side_by_side
 from pipeline.splat import Gaussians, Rendering, render
-from pipeline.spread import spread_end_to_end
-from pipeline.turntable import orbit, visible_extent
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import AvatarMethod
 from stages.evaluate.scores import ScoredFrame

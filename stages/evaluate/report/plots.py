@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.curves import Line
+from pipeline.clip.curves import Line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

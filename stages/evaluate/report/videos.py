@@ -11,9 +11,9 @@ from torch import Tensor
 
 from pipeline.body import Pose
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
+from pipeline.orbit_cameras import Extent, orbit, relaxed_pose, visible_extent
 from pipeline.splat import Gaussians, render
-from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.methods import Animate
 from stages.evaluate.report.pictures import on_grey
 
