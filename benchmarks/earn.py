@@ -27,7 +27,7 @@ from pipeline.frames import write_png
 from pipeline.job import open_job
 from pipeline.metrics import Lpips
 from pipeline.process import make_results
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 REAL = ("smile", "oliver", "carphone", "balance")

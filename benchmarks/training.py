@@ -26,7 +26,7 @@ from pipeline.process import make_results
 from pipeline.splat import Rendering, render
 from pipeline.stage import Context
 from stages.evaluate.baselines import nearest_frames
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 from stages.train import run as train
 
 CROPS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}

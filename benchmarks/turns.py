@@ -32,7 +32,7 @@ from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, ident
 from pipeline.process import make_results
 from pipeline.splat import Gaussians, render
 from pipeline.turntable import orbit, visible_extent
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}

@@ -17,7 +17,7 @@ from pipeline.explain import explain
 from pipeline.guard import NotFiniteError, finite, require_finite, require_finite_files
 from pipeline.json_files import write_json
 from pipeline.tables import write_table
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 BAD = [math.nan, math.inf, -math.inf]
 KEY = "0123456789abcdef"

@@ -16,7 +16,7 @@ from pipeline.camera import facing_camera
 from pipeline.numba_kernels import threads
 from pipeline.splat import render
 from pipeline.workspace import REPOSITORY
-from stages.evaluate.rendering import animator
+from stages.evaluate.methods import baked_animation
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=16, groups=2, subdivisions=1)
 WITH_RESIDUALS = dataclasses.replace(SMALL, residual_parts=("face", "left_hand", "rest"), residual_width=8)
@@ -152,5 +152,5 @@ def test_evaluate_animates_the_baked_avatar_as_it_would_the_avatar(body):
     avatar = an_avatar(body, WITH_RESIDUALS)
     with torch.no_grad():
         expected = avatar.gaussians(a_pose(), 1.3).tensors()
-    for mine, theirs in zip(animator(avatar)(a_pose(), 1.3).tensors(), expected, strict=True):
+    for mine, theirs in zip(baked_animation(avatar)(a_pose(), 1.3).tensors(), expected, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)

@@ -1,19 +1,19 @@
-"""What was left out, and why: nothing is skipped silently."""
+"""The list of what was left out, and why: nothing is skipped silently."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
+
+import pandas as pd
 
 from pipeline.metrics.lpips import NETWORKS
 from pipeline.plan import Plan
 from pipeline.protocols import PLAN
-from stages.evaluate.evidence import Evidence
-from stages.evaluate.records import Gate
-from stages.evaluate.refinement import EFFECT, Refinement
-from stages.evaluate.scoring import HELD_OUT, TRAINING, Score
+from pipeline.records import Footage, Split
+from stages.evaluate.scores import HELD_OUT, TRAINING
 from stages.evaluate.settings import EvaluateSettings
+from stages.evaluate.test_pose_refinement import EFFECT, RefinedTestPoses
+from stages.evaluate.upstream import GateRecord
 
 _LPIPS_COST = {"vgg": "; on a CPU it takes twenty times as long as alex"}
 
@@ -32,24 +32,24 @@ class Omission:
 
 
 def omissions(
-    evidence: Evidence,
+    footage: Footage,
+    split: Split,
     settings: EvaluateSettings,
-    scores: Sequence[Score],
-    gate: Gate,
+    table: pd.DataFrame,
+    gate: GateRecord,
     plan: Plan,
-    refinement: Refinement,
+    refined: RefinedTestPoses,
 ) -> list[Omission]:
-    """What ingest, train and evaluate left out of this avatar and of its numbers."""
+    """The parts that ingest, train and evaluate left out of this avatar and of its numbers."""
     return [
-        *_of_the_clip(evidence),
+        *_of_the_clip(footage),
         *_of_the_avatar(gate),
-        *_of_the_numbers(evidence, settings, scores),
-        *_of_the_poses(evidence, settings, plan, refinement),
+        *_of_the_numbers(split, settings, table),
+        *_of_the_poses(split, settings, plan, refined),
     ]
 
 
-def _of_the_clip(evidence: Evidence) -> list[Omission]:
-    footage = evidence.footage
+def _of_the_clip(footage: Footage) -> list[Omission]:
     dropped = [(reason, count) for reason, count in sorted(footage.dropped.items()) if count]
     found = [Omission(_count(count, "frame"), reason) for reason, count in dropped]
     if footage.people > 1:
@@ -61,7 +61,7 @@ def _of_the_clip(evidence: Evidence) -> list[Omission]:
     return found
 
 
-def _of_the_avatar(gate: Gate) -> list[Omission]:
+def _of_the_avatar(gate: GateRecord) -> list[Omission]:
     if gate.kept >= gate.vertices:
         return []
     share = 100 * (1 - gate.kept / gate.vertices)
@@ -72,28 +72,26 @@ def _of_the_avatar(gate: Gate) -> list[Omission]:
     return [Omission("What the clip never showed", why)]
 
 
-def _of_the_numbers(
-    evidence: Evidence, settings: EvaluateSettings, scores: Sequence[Score]
-) -> list[Omission]:
+def _of_the_numbers(split: Split, settings: EvaluateSettings, table: pd.DataFrame) -> list[Omission]:
     found = []
-    learnt_from = len(evidence.split.train)
-    if not evidence.split.test:
+    learnt_from = len(split.train)
+    if not split.test:
         why = "every frame was trained on; the numbers say what was memorised"
         found.append(Omission("Held-out numbers", why))
-    trained = sum(one.split == TRAINING and one.metric == "psnr" for one in scores)
+    trained = int(((table["split"] == TRAINING) & (table["metric"] == "psnr")).sum())
     if trained < learnt_from:
         why = f"{trained} of {learnt_from} are scored, evenly spaced (evaluate.training_frames)"
         found.append(Omission("Scores of the other training frames", why))
-    if evidence.split.test and 0 < settings.baseline_frames < learnt_from:
+    if split.test and 0 < settings.baseline_frames < learnt_from:
         why = f"they draw on {settings.baseline_frames} of {learnt_from} (evaluate.baseline_frames)"
         found.append(Omission("Training frames in the baselines", why))
     for network in sorted(set(NETWORKS) - set(settings.lpips_networks)):
         why = f"not asked for (evaluate.lpips_networks){_LPIPS_COST.get(network, '')}"
         found.append(Omission(f"LPIPS with {network}", why))
-    if evidence.split.test:
+    if split.test:
         found += _of_the_extras(settings)
-    inside = [one for one in scores if (one.split, one.metric) == (HELD_OUT, "psnr_interior")]
-    bare = len({one.frame for one in inside if math.isnan(one.value)})
+    inside = table[(table["split"] == HELD_OUT) & (table["metric"] == "psnr_interior")]
+    bare = inside.loc[inside["value"].isna(), "frame"].nunique()
     if bare:
         found.append(Omission("Interior of " + _count(bare, "frame"), "the eroded mask is empty there"))
     return found
@@ -111,13 +109,13 @@ def _of_the_extras(settings: EvaluateSettings) -> list[Omission]:
 
 
 def _of_the_poses(
-    evidence: Evidence, settings: EvaluateSettings, plan: Plan, refinement: Refinement
+    split: Split, settings: EvaluateSettings, plan: Plan, refined: RefinedTestPoses
 ) -> list[Omission]:
-    if refinement.stopped:
-        frames = ", ".join(map(str, refinement.stopped))
+    if refined.stopped:
+        frames = ", ".join(map(str, refined.stopped))
         why = f"the loss of {frames} was not finite: shown in the pose of the fit, under both names"
-        return [Omission("Refinement of " + _count(len(refinement.stopped), "test pose"), why)]
-    if refinement.poses or not evidence.split.test:
+        return [Omission("Refinement of " + _count(len(refined.stopped), "test pose"), why)]
+    if refined.poses or not split.test:
         return []
     asked = settings.choices.refine_test_poses
     named = (

@@ -1,4 +1,4 @@
-"""What the report shows of the upstream stages' own records."""
+"""The upstream stages' own records, as the report shows them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RESIDUALS = pa.schema([("pixels", pa.float32())])
 
 @dataclasses.dataclass(frozen=True)
 class StageRecord:
-    """What a stage says of the run that made its result.
+    """A stage's record of the run that made its result.
 
     Attributes:
         name: the stage's.
@@ -46,8 +46,8 @@ class StageRecord:
 
 
 @dataclasses.dataclass(frozen=True)
-class Gate:
-    """How much of the body is modelled.
+class GateRecord:
+    """The part of the body that is modelled, as the visibility gate left it.
 
     Attributes:
         kept: body vertices that carry Gaussians.
@@ -96,8 +96,8 @@ def fit_seconds(fit: Path) -> dict[int, float]:
     return {step: float(at) for step, at in pairs if isinstance(step, int) and isinstance(at, int | float)}
 
 
-def read_gate(train: Path) -> Gate:
-    """What train's ``visibility.parquet`` and ``gate.json`` say.
+def read_gate(train: Path) -> GateRecord:
+    """Reads train's ``visibility.parquet`` and ``gate.json``.
 
     Raises:
         UserError: a file is missing or damaged.
@@ -108,7 +108,7 @@ def read_gate(train: Path) -> Gate:
     if not isinstance(found, dict) or not {"tau", "why", "definition"} <= set(found):
         raise UserError(f"{train / 'gate.json'} has no threshold: {remedy}")
     kept = table["kept"]
-    return Gate(
+    return GateRecord(
         int(kept.sum()), len(kept), table["captured"], float(found["tau"]), found["why"], found["definition"]
     )
 

@@ -1,4 +1,4 @@
-"""What stands beside the avatar and what judges it: mesh, second masks, faces, other cameras, protocols."""
+"""The methods beside the avatar, and the further metrics: faces, other cameras, protocols, flicker."""
 
 import dataclasses
 import json
@@ -14,13 +14,13 @@ from pipeline.errors import UserError
 from pipeline.frames import read_mask
 from pipeline.metrics.identity import Face
 from pipeline.records import read_cameras, write_cameras
-from stages.evaluate.assessment import Extras
-from stages.evaluate.evidence import read_evidence
-from stages.evaluate.mesh import nearest_known
-from stages.evaluate.scoring import Score, bounds, differences, intervals, table
-from stages.evaluate.second_mask import SecondMasks, edge, estimated, second_masks
+from stages.evaluate import statistics
+from stages.evaluate.report.tables import camera_table
+from stages.evaluate.scores import TableRow, score_table
+from stages.evaluate.second_mask import SecondMask, edge, estimated, second_mask
 from stages.evaluate.settings import EvaluateSettings
-from stages.evaluate.tables import camera_table
+from stages.evaluate.statistics import bounds, differences, intervals
+from stages.evaluate.textured_mesh import nearest_known
 from tests.stages.evaluate_subject import HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
 
 
@@ -34,15 +34,16 @@ def summary_of(output):
 
 
 def edges_of(clip):
-    evidence = read_evidence(clip.inputs)
-    return SecondMasks({frame: edge(evidence.mask(frame)) for frame in TEST[:2]}, "the same, 1 px smaller")
+    evaluated = clip.clip()
+    masks = {frame: edge(evaluated.mask(frame)) for frame in TEST[:2]}
+    return SecondMask(evaluated, masks, "the same, 1 px smaller")
 
 
 # The ceiling
 
 
 def test_the_truth_under_another_mask_is_the_ceiling_and_no_contestant(clip):
-    output = clip.evaluate(extras=Extras(second=edges_of(clip)))
+    output = clip.evaluate(second=edges_of(clip))
     summary, report = summary_of(output), (output / "report.html").read_text()
     ceiling = summary["means"]["test"]["second_mask"]
     assert 15 < ceiling["psnr"] < summary["means"]["test"]["avatar"]["psnr"]  # this avatar made the masks
@@ -64,25 +65,25 @@ def test_the_edge_is_one_pixel_further_in_and_open_at_the_border():
 
 
 def test_masks_of_others_are_read_by_frame_number_and_refused_where_they_do_not_fit(clip, tmp_path):
-    evidence, folder = read_evidence(clip.inputs), tmp_path / "theirs"
+    evaluated, folder = clip.clip(), tmp_path / "theirs"
     folder.mkdir()
     for frame, name in zip(TEST, ("000018.png", "00020.png", "22.png"), strict=True):
         assert int(name[:-4]) == frame
         cv2.imwrite(str(folder / name), np.full((HEIGHT, WIDTH), frame, np.uint8))
     context = clip.context(second_mask=str(folder))
-    found = second_masks(context, evidence)
+    found = second_mask(context, evaluated)
     assert {frame: int(mask[0, 0]) for frame, mask in found.masks.items()} == {one: one for one in TEST}
     assert found.source == "theirs"
     cv2.imwrite(str(folder / "22.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(UserError, match=r"22\.png: not a grey picture of 64 x 48"):
-        second_masks(context, evidence)
+        second_mask(context, evaluated)
     (folder / "22.png").unlink()
     with pytest.raises(UserError, match=r"second_mask=.*no 000022\.png or 22\.png"):
-        second_masks(context, evidence)
+        second_mask(context, evaluated)
 
 
 def test_of_the_estimators_two_segmentations_the_agreeing_one_is_taken(clip):
-    evidence = read_evidence(clip.inputs)
+    evaluated = clip.clip()
 
     @dataclasses.dataclass
     class Seen:
@@ -102,20 +103,20 @@ def test_of_the_estimators_two_segmentations_the_agreeing_one_is_taken(clip):
             return Seen(np.ones_like(blurred), blurred)
 
     counted = []
-    found = estimated(Stub(), evidence, TEST, lambda: counted.append(1))
+    found = estimated(Stub(), evaluated, TEST, lambda: counted.append(1))
     assert set(found.masks) == set(TEST[:2]) and len(counted) == 3
     assert "selfie" in found.source and found.masks[TEST[0]].shape == (HEIGHT, WIDTH)
-    assert not second_masks(clip.context(second_mask="off"), evidence).masks
+    assert not second_mask(clip.context(second_mask="off"), evaluated).masks
 
 
 # Protocols
 
 
-def noisy(rotation, expression, transl, time):
+def noisy(pose, time):
     """The blob with a speck beside it, which no mask holds."""
-    right = stand_in(rotation, expression, transl, time)
+    right = stand_in(pose, time)
     means = right.means.clone()
-    means[0] = transl + torch.tensor([0.5, 0.3, 0.0])
+    means[0] = pose.transl + torch.tensor([0.5, 0.3, 0.0])
     colors = right.colors.clone()
     colors[0] = 1.0
     return dataclasses.replace(right, means=means, colors=colors)
@@ -128,8 +129,8 @@ def test_the_truths_mask_on_both_pictures_forgives_and_says_so(clip):
     strict, kind = (summary_of(one)["means"]["test"]["avatar"] for one in (own, both))
     assert kind["psnr"] > strict["psnr"] + 1
     # What the protocol chose is among the composites that are always shown.
-    for means in (strict, kind):
-        assert means["psnr_black_own"] == strict["psnr"] and means["psnr_black_truth"] == kind["psnr"]
+    for one in (strict, kind):
+        assert one["psnr_black_own"] == strict["psnr"] and one["psnr_black_truth"] == kind["psnr"]
     assert summary_of(paper)["means"] == summary_of(both)["means"]
     assert summary_of(paper)["choices"]["protocol"] == "paper_black"
     assert "Protocol paper_black. " in summary_of(paper)["protocol"]
@@ -154,7 +155,7 @@ class Faces:
 
 
 def test_faces_are_compared_frame_by_frame(clip):
-    summary = summary_of(clip.evaluate(extras=Extras(reader=Faces())))
+    summary = summary_of(clip.evaluate(embedder=Faces()))
     means = summary["means"]["test"]
     assert 10 * means["avatar"]["identity_distance"] < means["nearest_frame"]["identity_distance"]
     assert means["avatar"]["identity_cosine"] >= means["nearest_frame"]["identity_cosine"]
@@ -162,11 +163,11 @@ def test_faces_are_compared_frame_by_frame(clip):
 
 
 def test_a_face_that_the_render_lacks_is_counted(clip):
-    def invisible(*pose):
-        right = stand_in(*pose)
+    def invisible(pose, time):
+        right = stand_in(pose, time)
         return dataclasses.replace(right, opacities=torch.full((40,), 0.01))
 
-    means = summary_of(clip.evaluate(invisible, extras=Extras(reader=Faces())))["means"]["test"]["avatar"]
+    means = summary_of(clip.evaluate(invisible, embedder=Faces()))["means"]["test"]["avatar"]
     assert means["identity_found"] == 0 and "identity_distance" not in means
 
 
@@ -179,7 +180,7 @@ def test_held_out_frames_of_another_camera_stand_apart(clip):
     turn = torch.tensor([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
     aside = dataclasses.replace(cameras[TEST[0]], rotation=turn, translation=torch.tensor([-2.0, 0.0, 2.0]))
     write_cameras(path, {**cameras, TEST[0]: aside})
-    assert read_evidence(clip.inputs).other_cameras == {TEST[0]}
+    assert clip.clip().other_cameras == {TEST[0]}
     output = clip.evaluate()
     summary = summary_of(output)
     assert summary["frames_of_other_cameras"] == 1
@@ -194,11 +195,11 @@ def test_held_out_frames_of_another_camera_stand_apart(clip):
 
 
 def test_a_mannequins_cameras_are_shown_by_name(clip):
-    views = [
-        Score(2, "views", "avatar", metric, value, "back")
+    rows = [
+        TableRow(2, "views", "avatar", metric, value, "back")
         for metric, value in (("psnr", 20.0), ("psnr_unseen", 12.0), ("psnr_seen", 25.0))
     ]
-    output = clip.evaluate(views=views)
+    output = clip.evaluate(other_cameras=rows)
     shown = camera_table(summary_of(output))
     assert [row.label for row in shown.rows] == ["back: avatar"]
     assert [cell.text for cell in shown.rows[0].cells] == ["20.00", "25.00", "12.00"]
@@ -225,21 +226,22 @@ def test_differences_are_taken_frame_by_frame():
         "second_mask": (None, 29.0, None),
     }
     scores = [
-        Score(frame, "test", method, "psnr", value)
+        TableRow(frame, "test", method, "psnr", value)
         for method, each in values.items()
         for frame, value in enumerate(each)
         if value is not None
     ]
     settings = EvaluateSettings(second_mask="edge")
-    over = differences(scores, ["psnr"], settings)
+    table = score_table(scores)
+    over = differences(table, ["psnr"], settings)
     assert over["nearest_frame"]["psnr"]["mean"] == pytest.approx(2.0)
     assert over["nearest_frame"]["psnr"]["low"] < 1 < 3 < over["nearest_frame"]["psnr"]["high"]
     assert over["second_mask"]["psnr"] == {"mean": 1.0, "low": 1.0, "high": 1.0}
-    wild = [Score(frame, "test", "avatar", "ssim", value) for frame, value in enumerate((0.5, 0.9, 0.98))]
-    assert intervals(wild, settings)["test"]["avatar"]["ssim"][1] == 1.0  # and no more
+    wild = [TableRow(frame, "test", "avatar", "ssim", value) for frame, value in enumerate((0.5, 0.9, 0.98))]
+    assert intervals(score_table(wild), settings)["test"]["avatar"]["ssim"][1] == 1.0  # and no more
     assert bounds("lpips_alex_face")[0] == bounds("flicker")[0] == 0
-    low, high = intervals(scores, settings)["test"]["avatar"]["psnr"]
-    assert low < table(scores, ["psnr"])["test"]["avatar"]["psnr"] < high
+    low, high = intervals(table, settings)["test"]["avatar"]["psnr"]
+    assert low < statistics.means(table, ["psnr"])["test"]["avatar"]["psnr"] < high
 
 
 def test_intervals_stand_beside_every_mean(clip):

@@ -1,4 +1,4 @@
-"""The curves of fit and train as drawings that suit light and dark pages."""
+"""Plots of the curves of fit and train and of the visibility scores, which suit light and dark pages."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ _INK = "#808080"  # legible on white and on near-black
 _COLORS = ("#3b82c4", "#d07f2c", "#5a9e6f")
 
 
-def draw_curve(lines: Mapping[str, Line]) -> list[str]:
+def plot_training(lines: Mapping[str, Line]) -> list[str]:
     """Held-out PSNR and the loss terms against iterations, an SVG element each; none without lines.
 
     The same lines give the same text. Every loss term but L1 and SSIM is part of the regularisers.
     """
     losses = _loss_lines(lines)
     held_out = {"held out": lines[_PSNR]} if lines.get(_PSNR) else {}
-    return [_draw(title, group) for title, group in (("PSNR, dB", held_out), ("loss", losses)) if group]
+    return [_plot(title, group) for title, group in (("PSNR, dB", held_out), ("loss", losses)) if group]
 
 
-def draw_fit(lines: Mapping[str, Line], seconds: Mapping[int, float]) -> list[str]:
-    """What accuracy cost the registration: reprojection error against seconds, an SVG; none without both.
+def plot_registration(lines: Mapping[str, Line], seconds: Mapping[int, float]) -> list[str]:
+    """The registration's reprojection error against seconds, an SVG; none without both.
 
     Args:
         lines: fit's curve.
         seconds: iteration -> seconds since its start, as recorded beside it.
     """
     pixels = [(seconds[step], value) for step, value in lines.get("pixels", []) if step in seconds]
-    return [_draw("reprojection error, px", {"all trusted points": pixels}, "seconds")] if pixels else []
+    return [_plot("reprojection error, px", {"all trusted points": pixels}, "seconds")] if pixels else []
 
 
 def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
@@ -52,7 +52,7 @@ def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
     return {**found, "regularisers": sorted(rest.items())} if rest else found
 
 
-def draw_scores(scores: np.ndarray, tau: float) -> list[str]:
+def plot_visibility(scores: np.ndarray, tau: float) -> list[str]:
     """The histogram of visibility scores with the gate's threshold on it, an SVG; none without scores.
 
     Args:
@@ -66,10 +66,10 @@ def draw_scores(scores: np.ndarray, tau: float) -> list[str]:
     group = {"body vertices": [*steps, (1.0, float(counts[-1]))]}
     if tau:
         group[f"tau* = {tau:.2f}"] = [(tau, 0.8), (tau, float(counts.max()))]
-    return [_draw("how often each vertex is seen", group, "score")]
+    return [_plot("how often each vertex is seen", group, "score")]
 
 
-def _draw(title: str, group: Mapping[str, Sequence[tuple[float, float]]], across: str = "iteration") -> str:
+def _plot(title: str, group: Mapping[str, Sequence[tuple[float, float]]], across: str = "iteration") -> str:
     # Slow to import, and only this function draws.
     import matplotlib
     from matplotlib.figure import Figure

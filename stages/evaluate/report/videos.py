@@ -1,4 +1,4 @@
-"""A short motion that was never filmed: the head turns, the arms go up and come down, the trunk leans."""
+"""The report's videos: the avatar turned about, and in a motion that was never filmed."""
 
 from __future__ import annotations
 
@@ -9,18 +9,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.body import Pose
 from pipeline.body.joints import JOINT_NAMES
+from pipeline.camera import Camera
 from pipeline.splat import Gaussians, render
 from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
-from stages.evaluate.rendering import Animate, on_grey
+from stages.evaluate.methods import Animate
+from stages.evaluate.report.pictures import on_grey
 
 HEAD_TURN = 0.6  # radians to either side
 ARM_RAISE = 1.9  # radians, from hanging to above the horizontal
 LEAN = 0.15  # radians to either side
 
 
+@torch.no_grad()
+def turntable_pictures(gaussians: Gaussians, cameras: list[Camera]) -> Iterator[np.ndarray]:
+    """The picture of each camera, [H, W, 3] uint8 RGB on grey."""
+    for camera in cameras:
+        yield on_grey(render(gaussians, camera))
+
+
 def motion_poses(count: int, arm_angle: float) -> Iterator[Tensor]:
     """The poses of the motion, [55, 3] rotation vectors each; it ends where it begins.
+
+    The head turns, the arms go up and come down, the trunk leans.
 
     Args:
         count: frames.
@@ -54,7 +66,7 @@ def motion_pictures(
     """
 
     def frame(rotation: Tensor) -> Gaussians:
-        return animate(rotation, torch.zeros(expressions), torch.zeros(3), None)
+        return animate(Pose(rotation, torch.zeros(expressions), torch.zeros(3)), None)
 
     poses = list(motion_poses(count, arm_angle))
     # The middle of the motion reaches highest, the quarters furthest aside.

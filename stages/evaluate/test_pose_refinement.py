@@ -3,7 +3,7 @@
 The protocol of the NeuMan benchmark: the networks are frozen, and of each held-out frame rotation,
 expression and translation move, driven by that image alone. It tells the avatar's own error from the
 fit's, and it has looked at the answer: its numbers stand beside those at the fit's poses and never replace
-them.
+them. The method that shows the refined poses is an ``AvatarMethod`` of the name ``REFINED``.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipeline.body import Poses, write_poses
+from pipeline.body import Pose, Poses, write_poses
 from pipeline.composite import BACKGROUNDS, over
 from pipeline.metrics.ssim import rounded_gaussian_window, ssim_loss
 from pipeline.plan import Plan
 from pipeline.protocols import ON, PLAN
 from pipeline.splat import render
-from stages.evaluate.evidence import Evidence, Pose
-from stages.evaluate.rendering import Animate
+from stages.evaluate.evaluated_clip import EvaluatedClip
+from stages.evaluate.methods import Animate
 from stages.evaluate.settings import EvaluateSettings
 
 EFFECT = "test_time_refinement"  # the plan's name of it
@@ -33,8 +33,8 @@ DECAYS = (0.75, 0.95)  # shares of the steps after which a step is a tenth as lo
 
 
 @dataclasses.dataclass(frozen=True)
-class Refinement:
-    """What came of it.
+class RefinedTestPoses:
+    """The refined poses of the held-out frames.
 
     Attributes:
         poses: held-out frame -> its pose; the fit's where refinement stopped. Empty where none was asked for.
@@ -47,22 +47,22 @@ class Refinement:
     steps: int
 
 
-NONE = Refinement({}, (), 0)
+NOT_REFINED = RefinedTestPoses({}, (), 0)
 
 
-def called_for(settings: EvaluateSettings, plan: Plan) -> bool:
-    """Whether test poses are refined: as the protocol or a setting says, or the plan where they leave it."""
+def is_called_for(settings: EvaluateSettings, plan: Plan) -> bool:
+    """True where test poses are refined: as the protocol or a setting says, else as the plan does."""
     asked = settings.choices.refine_test_poses
     return plan.on(EFFECT) if asked == PLAN else asked == ON
 
 
 def refine(
-    evidence: Evidence, animate: Animate, background: str, steps: int, advance: Callable[[], object]
-) -> Refinement:
+    clip: EvaluatedClip, animate: Animate, background: str, steps: int, advance: Callable[[], object]
+) -> RefinedTestPoses:
     """Refines the pose of every held-out frame.
 
     Args:
-        evidence: the clip.
+        clip: the clip.
         animate: a pose -> Gaussians, with gradients that reach the pose alone.
         background: what both images are composited on.
         steps: a frame.
@@ -70,23 +70,25 @@ def refine(
     """
     poses: dict[int, Pose] = {}
     stopped = []
-    for frame in evidence.split.test:
-        fitted = evidence.pose(frame)
-        refined = refined_pose(frame_loss(evidence, animate, background, frame), fitted, steps)
+    for frame in clip.split.test:
+        fitted = clip.pose(frame)
+        refined = refined_pose(frame_loss(clip, animate, background, frame), fitted, steps)
         if refined is None:
             stopped.append(frame)
         poses[frame] = refined or fitted
         advance()
-    return Refinement(poses, tuple(stopped), steps)
+    return RefinedTestPoses(poses, tuple(stopped), steps)
 
 
-def frame_loss(evidence: Evidence, animate: Animate, background: str, frame: int) -> Callable[[Pose], Tensor]:
+def frame_loss(
+    clip: EvaluatedClip, animate: Animate, background: str, frame: int
+) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
-    camera, seconds = evidence.cameras[frame], evidence.seconds(frame)
-    truth = evidence.person(frame, background)
+    camera, seconds = clip.camera(frame), clip.seconds.get(frame)
+    truth = clip.person(frame, background)
 
     def loss(pose: Pose) -> Tensor:
-        rendering = render(animate(*pose, seconds), camera)
+        rendering = render(animate(pose, seconds), camera)
         image = over(rendering.color, rendering.alpha, background)
         return image_loss(image, truth.to(image), BACKGROUNDS[background])
 
@@ -111,16 +113,17 @@ def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Po
         The pose; None where the loss or its gradient was not finite.
     """
     pose = _copy(fitted)
-    for part in pose:
+    parts = _parts(pose)
+    for part in parts:
         part.requires_grad_()
-    optimiser = torch.optim.Adam(pose, LEARNING_RATE)
+    optimiser = torch.optim.Adam(parts, LEARNING_RATE)
     decays = [max(1, int(share * steps)) for share in DECAYS]
     schedule = torch.optim.lr_scheduler.MultiStepLR(optimiser, decays, 0.1)
     least, best = float("inf"), fitted
     for step in range(steps + 1):
         value = loss(pose)
         # A renderer leaves out what is not finite, so that the loss may not show it.
-        if not _finite(value, *pose):
+        if not _finite(value, *parts):
             return None
         if value.item() < least:
             least, best = value.item(), _copy(pose)
@@ -129,28 +132,30 @@ def refined_pose(loss: Callable[[Pose], Tensor], fitted: Pose, steps: int) -> Po
         optimiser.zero_grad()
         value.backward()
         # What the image has no say in, such as an expression that the avatar lacks, has no gradient.
-        if not _finite(*(part.grad for part in pose if part.grad is not None)):
+        if not _finite(*(part.grad for part in parts if part.grad is not None)):
             return None
         optimiser.step()
         schedule.step()
     return best
 
 
-def write_refined(path: Path, refinement: Refinement) -> None:
+def write_refined(path: Path, refined: RefinedTestPoses) -> None:
     """Writes ``test_poses.parquet``: the refined poses in the layout of ``poses.parquet``.
 
-    ``valid`` says whether a frame was refined.
+    ``valid`` is true where a frame was refined.
     """
-    frames = tuple(sorted(refinement.poses))
-    poses = [refinement.poses[frame] for frame in frames]
-    rotation, expression, transl = (torch.stack(part) for part in zip(*poses, strict=True))
-    valid = torch.tensor([frame not in refinement.stopped for frame in frames])
-    write_poses(path, Poses(frames, rotation, expression, transl, valid))
+    frames = tuple(sorted(refined.poses))
+    poses = Poses.stack(frames, [refined.poses[frame] for frame in frames])
+    valid = torch.tensor([frame not in refined.stopped for frame in frames])
+    write_poses(path, dataclasses.replace(poses, valid=valid))
+
+
+def _parts(pose: Pose) -> tuple[Tensor, ...]:
+    return pose.rotation, pose.expression, pose.transl
 
 
 def _copy(pose: Pose) -> Pose:
-    rotation, expression, transl = (part.detach().clone() for part in pose)
-    return rotation, expression, transl
+    return Pose(*(part.detach().clone() for part in _parts(pose)))
 
 
 def _finite(*tensors: Tensor) -> bool:
