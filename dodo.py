@@ -21,15 +21,16 @@ from __future__ import annotations
 import functools
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
 from pipeline import assets as third_party
 from pipeline.artifact import Store
+from pipeline.config.request import Request, parse_request
 from pipeline.datasets import known_datasets, subjects_of
 from pipeline.errors import UserError
-from pipeline.job import Job, check_command_line, job_from_words, shown, wanted_keys, workspace_from_words
+from pipeline.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.process import run_stage_process
 from pipeline.stage import load_stages, usual
 from pipeline.subjects import known_subjects, load_subject
@@ -39,44 +40,35 @@ from pipeline.verify import verify
 DEFAULT_SUBJECT = "smile"
 
 
-def command_line_words() -> dict[str, str]:
-    """The NAME=VALUE words after ``doit run``; doit itself takes them out of its task names."""
-    pairs = (word.partition("=") for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
-    return {name: value for name, _, value in pairs}
-
-
-def datasets(words: dict[str, str]) -> tuple[str, ...]:
-    """The datasets that ``dataset=`` names."""
-    return tuple(name for name in words.get("dataset", "").split(",") if name)
-
-
-def chosen_subjects(words: dict[str, str]) -> tuple[str, ...]:
+def chosen_subjects(request: Request) -> tuple[str, ...]:
     """The subjects that the command line is about."""
-    if "subject" in words or not datasets(words):
-        return tuple(name for name in words.get("subject", DEFAULT_SUBJECT).split(",") if name)
-    workspace = workspace_from_words(words)
-    return tuple(dict.fromkeys(one for name in datasets(words) for one in subjects_of(workspace, name)))
+    if request.subjects or not request.datasets:
+        return request.subjects or (DEFAULT_SUBJECT,)
+    named = (one for name in request.datasets for one in subjects_of(request.workspace, name))
+    return tuple(dict.fromkeys(named))
 
 
-def checked_words() -> dict[str, str]:
-    """The words, refused with one line if a name or a value is wrong."""
-    words = command_line_words()
+def read_command_line() -> tuple[Request, tuple[str, ...]]:
+    """The request and its subjects, refused with one line if a name or a value is wrong.
+
+    The NAME=VALUE words are ours; doit itself takes them out of its task names.
+    """
     try:
-        check_command_line(words)
-        chosen = chosen_subjects(words)
-        if "source" in words and len(chosen) > 1:
+        request = parse_request(word for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
+        check_settings(request)
+        chosen = chosen_subjects(request)
+        if request.source and len(chosen) > 1:
             raise UserError("source= names the footage of one subject; run the subjects one by one")
-        for subject in chosen if "subject" in words else ():
-            load_subject(workspace_from_words(words), subject, words.get("source"), words.get("dataset"))
+        for subject in request.subjects:
+            load_subject(request.workspace, subject, request.source, request.dataset)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
-    return words
+    return request, chosen
 
 
-WORDS = checked_words()
-WORKSPACE = workspace_from_words(WORDS)
+REQUEST, CHOSEN = read_command_line()
+WORKSPACE = REQUEST.workspace
 STAGES = load_stages(WORKSPACE.stages)
-CHOSEN = chosen_subjects(WORDS)
 SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN}))
 ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
 # "doit clean" deletes what the default tasks made: all of it, also what is only made when asked for.
@@ -95,19 +87,10 @@ DOIT_CONFIG = {
 }
 
 
-def words_of(subject: str) -> dict[str, str]:
-    """The words that concern a subject: footage and dataset on the command line are the chosen one's.
-
-    Without ``subject=``, ``dataset=`` says which subjects; what each is part of its own file says.
-    """
-    own = ("source", "dataset") if subject not in CHOSEN or "subject" not in WORDS else ()
-    return {name: value for name, value in WORDS.items() if name not in own}
-
-
 @functools.cache
 def job_of(subject: str) -> Job:
     """The job of a subject, read when its first task is looked at."""
-    return job_from_words(subject, words_of(subject))
+    return open_job(subject, REQUEST)
 
 
 def is_current(stage: str, subject: str) -> bool:
@@ -120,7 +103,7 @@ def is_current(stage: str, subject: str) -> bool:
 
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself."""
-    reason = run_stage_process(stage, subject, words_of(subject))
+    reason = run_stage_process(stage, subject, REQUEST)
     return TaskFailed(reason) if reason else None
 
 
@@ -152,6 +135,7 @@ def remove_versions(stage: str, subject: str) -> None:
 def stage_task(stage: str, subject: str) -> dict:
     """One stage for one subject."""
     return {
+        "basename": stage,
         "name": subject,
         "doc": f"{stage} of {subject}",
         "task_dep": [
@@ -165,21 +149,14 @@ def stage_task(stage: str, subject: str) -> dict:
     }
 
 
-def stage_tasks(stage: str):
-    """A generator of one stage's tasks, as doit collects them."""
-    # "doit run animate subject=oliver" names the whole group; it is meant for the chosen subjects. Other
-    # stages keep the tasks of all subjects, which the stages after them name.
-    subjects = CHOSEN if stage in ON_REQUEST and stage in sys.argv[1:] else SUBJECTS
-
-    def tasks():
-        yield {"name": None, "doc": f"stage {stage}: a sub-task a subject"}
-        for subject in subjects:
+def task_stages():
+    """A task a stage, a sub-task a subject."""
+    for stage in STAGES:
+        yield {"basename": stage, "name": None, "doc": f"stage {stage}: a sub-task a subject"}
+        # "doit run animate subject=oliver" names the whole group; it is meant for the chosen subjects. Other
+        # stages keep the tasks of all subjects, which the stages after them name.
+        for subject in CHOSEN if stage in ON_REQUEST and stage in sys.argv[1:] else SUBJECTS:
             yield stage_task(stage, subject)
-
-    return tasks
-
-
-globals().update({f"task_{stage}": stage_tasks(stage) for stage in STAGES})
 
 
 def fetch_asset(name: str) -> TaskFailed | None:
@@ -208,7 +185,7 @@ def verify_subject(subject: str) -> TaskFailed | None:
     """Reads every byte of a subject's versions."""
     store = Store(WORKSPACE.artifacts)
     try:
-        count = verify(store, subject, STAGES, words_of(subject), wanted(subject))
+        count = verify(store, subject, STAGES, REQUEST.about(subject), wanted(subject))
     except UserError as error:
         return TaskFailed(str(error))
     print(f"{subject}: {count} version(s) whole")
@@ -250,20 +227,25 @@ def task_prune():
         }
 
 
+def run_studies(studies: Iterable[Callable[[Request], object]]) -> TaskFailed | None:
+    """Makes studies one after the other; one that fails does not stop the others."""
+    reasons = []
+    for study in studies:
+        try:
+            study(REQUEST)
+        except (UserError, OSError) as error:
+            reasons.append(str(error))
+    return TaskFailed("; ".join(reasons)) if reasons else None
+
+
 def compare_datasets() -> TaskFailed | None:
     """Makes the tables of the chosen datasets."""
-    from pipeline.compare import compare
+    from pipeline.studies.compare import compare
 
-    names = datasets(WORDS)
-    if not names:
+    if not REQUEST.datasets:
         known = ", ".join(known_datasets(WORKSPACE))
         return TaskFailed(f"compare needs a dataset: doit run compare dataset=NAME; there are {known}")
-    try:
-        for name in names:
-            compare(name, WORDS)
-    except UserError as error:
-        return TaskFailed(str(error))
-    return None
+    return run_studies(functools.partial(compare, name) for name in REQUEST.datasets)
 
 
 def task_compare():
@@ -276,7 +258,7 @@ def batch_subjects() -> TaskFailed | None:
     from pipeline.batch import run_batch
 
     try:
-        outcomes = run_batch(CHOSEN, WORDS)
+        outcomes = run_batch(CHOSEN, REQUEST)
     except (UserError, OSError) as error:
         return TaskFailed(str(error))
     failed = [one.subject for one in outcomes if one.stage]
@@ -292,31 +274,16 @@ def ablate_subjects() -> TaskFailed | None:
     """Makes the ablation of each dataset, or of each subject."""
     from pipeline.studies.ablation import ablate
 
-    named = "subject" not in WORDS and datasets(WORDS)
-    studies = (
-        [(name, subjects_of(WORKSPACE, name)) for name in named]
-        if named
-        else [(one, (one,)) for one in CHOSEN]
-    )
-    return each_study([functools.partial(ablate, name, subjects) for name, subjects in studies])
+    named = () if REQUEST.subjects else REQUEST.datasets
+    groups = {name: subjects_of(WORKSPACE, name) for name in named} or {one: (one,) for one in CHOSEN}
+    return run_studies(functools.partial(ablate, name, group) for name, group in groups.items())
 
 
 def tradeoff_subjects() -> TaskFailed | None:
     """Makes the study of what accuracy costs of each subject."""
     from pipeline.studies.tradeoff import tradeoff
 
-    return each_study([functools.partial(tradeoff, subject) for subject in CHOSEN])
-
-
-def each_study(studies: list[Callable[[dict[str, str]], object]]) -> TaskFailed | None:
-    """Makes studies one after the other; one that fails does not stop the others."""
-    reasons = []
-    for study in studies:
-        try:
-            study(WORDS)
-        except (UserError, OSError) as error:
-            reasons.append(str(error))
-    return TaskFailed("; ".join(reasons)) if reasons else None
+    return run_studies(functools.partial(tradeoff, subject) for subject in CHOSEN)
 
 
 def studied_assets() -> list[str]:

@@ -18,10 +18,11 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.avatars import Pose, avatar_camera, avatar_of, poses_of
+from benchmarks.avatars import avatar_camera, avatar_of, poses_of
 from benchmarks.machine import described, prepare
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import BakedAvatar, bake
+from pipeline.body import Pose
 from pipeline.splat import Gaussians, render
 
 COUNTS, SIZES = (10_000, 40_000, 167_000), (256, 512)
@@ -100,12 +101,12 @@ def _race(avatar: Avatar, baked: BakedAvatar, size: int, repeats: int) -> list[T
     """Everybody's frames, in turns."""
 
     def each_frame(pose: Pose) -> Gaussians:
-        return avatar.pose(avatar.decode(), *pose.values()).gaussians
+        return avatar.pose(avatar.decode(), pose).gaussians
 
     ways = {
         EACH_FRAME: each_frame,
-        UNBAKED: lambda pose: avatar.gaussians(*pose.values()),
-        BAKED: lambda pose: baked.gaussians(*pose.values()),
+        UNBAKED: lambda pose: avatar.gaussians(pose),
+        BAKED: lambda pose: baked.gaussians(pose),
     }
     poses, camera = poses_of(avatar, POSES), avatar_camera(size)
     times: dict[str, list[tuple[tuple[float, float], tuple[float, float]]]] = {name: [] for name in ways}

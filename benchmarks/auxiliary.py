@@ -28,11 +28,14 @@ from benchmarks import machine
 from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
+from pipeline.boxes import Box, person_box
 from pipeline.camera import Camera
+from pipeline.composite import composite_frame
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask, write_png
-from pipeline.job import Job, job_from_words, run_stage
-from pipeline.metrics import Lpips, composite, psnr, ssim
+from pipeline.job import Job, open_job, run_stage
+from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.records import read_split, write_cameras
 from pipeline.splat import render
 from stages.ingest.mannequin.footage import Filming
@@ -114,7 +117,7 @@ def _compared(
         "auxiliary.texture_guidance": "false", "train.held_out_frames": "0",
     }  # fmt: skip
     words |= dict(word.split("=", 1) for word in options.words)
-    base = job_from_words(f"mannequin_{framing}", words)
+    base = open_job(f"mannequin_{framing}", parse_request(words, f"mannequin_{framing}"))
     ingest, fit = _made(base, "ingest"), _made(base, "fit")
     scene = _scene(base)
     truth = folder / f"truth_{framing}"
@@ -125,7 +128,7 @@ def _compared(
         own = CONTESTANTS[name]
         if own["auxiliary.generator"] == "folder":
             own = {**own, "auxiliary.folder": str(truth), "auxiliary.check": "false"}
-        job = job_from_words(base.subject.name, {**words, **own})
+        job = open_job(base.subject.name, parse_request({**words, **own}, base.subject.name))
         for stage in ("plan", "auxiliary"):
             if stage in job.stages:
                 _made(job, stage)
@@ -168,16 +171,15 @@ def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, co
     train, poses = read_split(ingest.folder / "split.json").train, read_poses(fit.folder / "poses.parquet")
     for kind in ("frames", "masks"):
         (folder / kind).mkdir(parents=True)
-    cameras, rows = {}, []
+    cameras, filmed = {}, []
     for number in range(count):
         frame, camera = train[number * len(train) // count], around(scene, 360 * number / count)
         picture = _filmed(scene, frame, camera)
         write_frame(folder / "frames", number, picture.image)
         write_mask(folder / "masks", number, picture.mask)
         cameras[number] = camera
-        rows.append(poses.index(frame))
-    chosen = Poses(tuple(range(count)), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
-    write_poses(folder / "poses.parquet", chosen)
+        filmed.append(poses.pose(frame))
+    write_poses(folder / "poses.parquet", Poses.stack(range(count), filmed))
     write_cameras(folder / "cameras.parquet", cameras)
 
 
@@ -195,14 +197,13 @@ def _scored(
     poses = read_poses(fit.folder / "poses.parquet")
     scores = []
     for frame in read_split(ingest.folder / "split.json").test:
-        row = poses.index(frame)
-        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        gaussians = avatar.gaussians(poses.pose(frame))
         for degrees in UNSEEN if side == "unseen" else (0.0,):
             camera = around(scene, degrees)
             picture = _filmed(scene, frame, camera)
-            target = composite(picture.image, picture.mask)
+            target = composite_frame(picture.image, picture.mask)
             image = render(gaussians, camera).color.clamp(0, 1)
-            part = _box(picture.mask)
+            part = box_of(picture.mask).slices
             pair = image[part], target[part]
             scores.append((psnr(*pair), ssim(*pair), float(network(*pair))))
             if len(scores) <= 3:
@@ -213,13 +214,9 @@ def _scored(
     return tuple(np.mean(scores, axis=0).tolist())  # type: ignore[return-value]
 
 
-def _box(mask: np.ndarray) -> tuple[slice, slice]:
-    """The person's rows and columns with a margin."""
-    parts = []
-    for axis, length in ((1, mask.shape[0]), (0, mask.shape[1])):
-        inside = np.flatnonzero((mask > 127).any(axis))
-        parts.append(slice(max(0, inside[0] - MARGIN), min(length, inside[-1] + 1 + MARGIN)))
-    return parts[0], parts[1]
+def box_of(mask: np.ndarray) -> Box:
+    """The person's box with a margin; the whole picture where nobody is."""
+    return person_box([mask], MARGIN) or Box.whole(mask)
 
 
 def _print(rows: list[Row]) -> None:

@@ -22,16 +22,18 @@ import numpy as np
 import torch
 
 from benchmarks import machine
-from benchmarks.auxiliary import _box, _made
+from benchmarks.auxiliary import _made, box_of
 from benchmarks.held_out_views import _job
 from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body, read_poses
+from pipeline.composite import composite_frame
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.metrics import composite, psnr
+from pipeline.metrics import psnr
 from pipeline.records import read_cameras
 from pipeline.splat import render
+from pipeline.spread import spread_from_start
 
 CAMERAS = (1, 3, 4)
 FRAMES = 4  # that are scored in each camera
@@ -113,14 +115,12 @@ def _scored(
     poses, cameras = read_poses(fit.folder / "poses.parquet"), read_cameras(seen.folder / "cameras.parquet")
     common = sorted(set(poses.frames) & set(cameras))
     plain, shifted = [], []
-    for place in range(min(FRAMES, len(common))):
-        frame = common[place * len(common) // min(FRAMES, len(common))]
-        row = poses.index(frame)
+    for place, frame in enumerate(spread_from_start(common, FRAMES)):
         image, mask = read_frame(seen.folder / "frames", frame), read_mask(seen.folder / "masks", frame)
-        target = composite(image, mask)
-        gaussians = avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row])
+        target = composite_frame(image, mask)
+        gaussians = avatar.gaussians(poses.pose(frame))
         made = render(gaussians, cameras[frame]).color.clamp(0, 1)
-        part = _box(mask)
+        part = box_of(mask).slices
         plain.append(psnr(made[part], target[part]))
         shifted.append(psnr(_moved(made, target)[part], target[part]))
         if place in (0, 2):

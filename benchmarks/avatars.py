@@ -8,25 +8,12 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
-from pipeline.body import BodyModel, load_body, mean_identity, subdivide
+from pipeline.body import BodyModel, Pose, load_body, mean_identity, subdivide
 from pipeline.camera import Camera, facing_camera
 from pipeline.workspace import REPOSITORY
 
 TRANSL = (0.0, 0.41, -3.0)  # metres: the middle of the open body, three metres before the camera
 LARGEST_LEVEL = 2
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """One frame's pose: rotation [55, 3] radians, expression [E], transl [3] metres."""
-
-    rotation: Tensor  # [55, 3]
-    expression: Tensor  # [E]
-    transl: Tensor  # [3]
-
-    def values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The arguments of ``Avatar.pose`` and ``Avatar.gaussians``."""
-        return self.rotation, self.expression, self.transl
 
 
 def open_body() -> BodyModel:

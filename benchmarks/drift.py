@@ -19,12 +19,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from benchmarks.avatars import Pose, avatar_camera, avatar_of, open_body, poses_of
+from benchmarks.avatars import avatar_camera, avatar_of, open_body, poses_of
 from benchmarks.machine import described, prepare
 from benchmarks.step import _photometric, _regularisers
 from benchmarks.straightforward import StraightforwardAvatar
 from pipeline.avatar import Architecture, Avatar
-from pipeline.body import mean_identity
+from pipeline.body import Pose, mean_identity
 from pipeline.metrics import psnr
 from pipeline.splat import render
 
@@ -53,7 +53,7 @@ class Run:
     def step(self, pose: Pose, target: Tensor, background: Tensor) -> None:
         """One optimiser step on one frame."""
         decoded = self.model.decode()
-        posed = self.model.pose(decoded, *(one.to(self.dtype) for one in pose.values()))
+        posed = self.model.pose(decoded, in_precision(pose, self.dtype))
         rendering = render(posed.gaussians, avatar_camera(PIXELS))
         loss = _photometric(rendering, target.to(self.dtype), background.to(self.dtype))
         loss = loss + _regularisers(decoded, posed)
@@ -65,8 +65,13 @@ class Run:
     @torch.no_grad()
     def picture(self, pose: Pose) -> Tensor:
         """What it shows of a pose, [H, W, 3] float64 in [0, 1]."""
-        posed = self.model.pose(self.model.decode(), *(one.to(self.dtype) for one in pose.values()))
+        posed = self.model.pose(self.model.decode(), in_precision(pose, self.dtype))
         return render(posed.gaussians, avatar_camera(PIXELS)).color.double().clamp(0, 1)
+
+
+def in_precision(pose: Pose, dtype: torch.dtype) -> Pose:
+    """A pose of another floating-point type."""
+    return Pose(pose.rotation.to(dtype), pose.expression.to(dtype), pose.transl.to(dtype))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -92,7 +97,7 @@ def race(steps: int) -> list[dict[str, Any]]:
     poses, camera = near(poses_of(truth, FRAMES + HELD_OUT)), avatar_camera(PIXELS)
     with torch.no_grad():
         decoded = truth.decode()
-        films = [render(truth.pose(decoded, *one.values()).gaussians, camera) for one in poses]
+        films = [render(truth.pose(decoded, one).gaussians, camera) for one in poses]
     runs = contestants(truth)
     generator, rows = torch.Generator().manual_seed(0), []
     print(f"{'step':>5} {'':<30}{'loss':>10}{'held out dB':>13}{'to float64 dB':>15}")

@@ -21,12 +21,13 @@ import cv2
 import numpy as np
 
 from benchmarks.machine import described, prepare
-from benchmarks.training import Clip, trained
-from pipeline.frames import read_frame, write_png
-from pipeline.job import job_from_words
+from benchmarks.training import JudgedClip, trained
+from pipeline.config.request import parse_request
+from pipeline.frames import write_png
+from pipeline.job import open_job
 from pipeline.metrics import Lpips
-from pipeline.study import made
-from stages.evaluate.scoring import Scorer
+from pipeline.process import make_results
+from stages.evaluate.frame_metrics import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 REAL = ("smile", "oliver", "carphone", "balance")
@@ -95,9 +96,9 @@ Table = dict[str, dict[str, Numbers]]
 
 def numbers_of(subject: str, variant: str, words: Mapping[str, str], pictures: Path | None) -> Numbers:
     """Trains one variant on one subject and scores it."""
-    job = job_from_words(subject, words)
-    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
-    clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
+    job = open_job(subject, parse_request(words, subject))
+    folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
+    clip = JudgedClip.read(folders["ingest"], folders["fit"], job.workspace.body_file, HELD_OUT)
     scorer = Scorer({"alex": Lpips(job.workspace.assets / "lpips", "alex")})
     if variant == NEAREST:
         return with_hands(clip.nearest_scores(scorer)) | {"seconds": 0.0}
@@ -115,11 +116,11 @@ def with_hands(scores: Mapping[str, float]) -> Numbers:
     return {name: both.get(name, math.nan) for name in METRICS}
 
 
-def write_crops(path: Path, clip: Clip, avatar) -> None:
+def write_crops(path: Path, clip: JudgedClip, avatar) -> None:
     """Writes face and hands of the held-out frames, as filmed above the avatar's."""
     rows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for frame in clip.test[:: max(1, len(clip.test) // 3)]:
-        filmed = read_frame(clip.ingest / "frames", frame)
+        filmed = clip.clip.frame(frame)
         shown = (255 * clip.render(avatar, frame).color.clamp(0, 1)).byte().numpy()
         for box in clip.crops(frame).values():
             for row, image in zip(rows, (filmed, shown), strict=True):

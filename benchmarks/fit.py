@@ -8,7 +8,7 @@ Three tables, of which ``--detectors``, ``--framings``, ``--variants`` and ``--n
   with measured errors: ``mediapipe`` puts unseen points outside the picture, ``heatmap`` (such as DWPose)
   inside it; ``regressor`` is heatmap's points with a regressor's poses to start from, as the paper has;
 - what posing the landmarks costs beside posing the whole mesh and picking them;
-- the effort knob: error against seconds over iterations, for each solver. ``--figure FILE`` draws it.
+- the effort knob: error against seconds over iterations. ``--figure FILE`` draws it.
 
 Seconds are of this machine and one process; the fit computes on one thread.
 """
@@ -30,23 +30,22 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.fit_truth import ANCHORS, SOURCES, Clip, Errors, Stage, load_stage, make_clips, measure
+from benchmarks.fit_truth import ANCHORS, SOURCES, Errors, Stage, TrueClip, load_stage, make_clips, measure
 from pipeline.body import (
     Identity,
     expression_offsets,
+    forward_kinematics,
+    linear_blend_skinning,
     locate,
-    matrix_transforms,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.body.landmarks import join
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.face_offset import spread_matrix
 from stages.fit.parameters import Parameters, landmark_model, parameters_of
 from stages.fit.registration import register
-from stages.fit.settings import SOLVERS, FitSettings
-from stages.fit.solver import STEPS
+from stages.fit.settings import FitSettings
 from stages.ingest.mannequin import FRAMINGS, MannequinSpec
 
 MASKED = "masked"
@@ -83,7 +82,6 @@ class Run:
     motion: str
     identity: int
     variant: str
-    solver: str
     iterations: int
     seconds_per_100_frames: float
     errors: Errors
@@ -151,7 +149,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 def _clips(
     framing: str, stage: Stage, detectors: tuple[str, ...], quick: bool, bvh: Path | None
-) -> Iterator[Clip]:
+) -> Iterator[TrueClip]:
     """The clips of a framing, as each detector sees them."""
     motions = MOTIONS[framing][: 1 if quick else None]
     if bvh is not None and framing == "full":
@@ -165,7 +163,7 @@ def _clips(
             yield from make_clips(spec, stage, detectors)
 
 
-def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
+def fit(clip: TrueClip, stage: Stage, variant: str, settings: FitSettings) -> Run:
     """Fit one clip and measure it."""
     started = time.perf_counter()
     registration = register(
@@ -174,15 +172,14 @@ def fit(clip: Clip, stage: Stage, variant: str, settings: FitSettings) -> Run:
     seconds = time.perf_counter() - started
     spec = clip.spec
     return Run(
-        clip.detector, spec.framing, Path(spec.motion).name, spec.identity, variant, settings.solver,
-        settings.iterations,
+        clip.detector, spec.framing, Path(spec.motion).name, spec.identity, variant, settings.iterations,
         100 * seconds / spec.frames,
         measure(registration.identity, registration.poses, clip, stage),
     )  # fmt: skip
 
 
 def _error_table(
-    clips: list[Clip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
+    clips: list[TrueClip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
 ) -> Iterator[str]:
     """Fit the clips of one framing and detector in each variant; append the runs, yield lines."""
     base = FitSettings() if iterations is None else FitSettings(iterations=iterations)
@@ -201,19 +198,17 @@ def _error_table(
 
 
 def _effort_table(
-    clips: list[Clip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
+    clips: list[TrueClip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
 ) -> Iterator[str]:
     """Fit one clip of each framing with every effort; append the runs, yield lines."""
     names = ", ".join(clip.spec.framing for clip in clips)
-    yield f"\neffort, {clips[0].detector} keypoints, mean of one clip each of {names}"
+    yield f"\neffort in iterations, {clips[0].detector} keypoints, mean of one clip each of {names}"
     yield _row("", *COLUMNS, "s/100 fr.")
-    for solver in SOLVERS:
-        # The second-order solver takes its own number of steps, whatever is set.
-        for iterations in efforts if solver == "adam" else (STEPS,):
-            settings = dataclasses.replace(FitSettings(), iterations=iterations, solver=solver)
-            many = [fit(clip, stage, MASKED, settings) for clip in clips]
-            runs.extend(many)
-            yield _row(f"{solver} {iterations}", *_cells(many))
+    for iterations in efforts:
+        settings = FitSettings(iterations=iterations)
+        many = [fit(clip, stage, MASKED, settings) for clip in clips]
+        runs.extend(many)
+        yield _row(str(iterations), *_cells(many))
 
 
 def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
@@ -240,9 +235,13 @@ def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
     def of_mesh(parameters: Parameters) -> Tensor:
         identity = Identity(parameters.betas, parameters.joint_offset, spread @ parameters.face_control)
         rest = rest_vertices(body, identity) + expression_offsets(body, parameters.expression)
-        transforms, joints = matrix_transforms(parameters.matrices, rest_joints(body, identity), body.parents)
+        transforms, joints = forward_kinematics(
+            parameters.matrices, rest_joints(body, identity), body.parents
+        )
         place = parameters.transl[:, None]
-        return locate(points, joints + place, skin(transforms, body.skinning_weights, rest) + place)
+        return locate(
+            points, joints + place, linear_blend_skinning(transforms, body.skinning_weights, rest) + place
+        )
 
     away = (of_landmarks(start) - of_mesh(start)).norm(dim=-1).max()
     assert away < 1e-3, f"landmarks posed alone are {float(away):.4f} m from those of the mesh"
@@ -263,19 +262,15 @@ def _milliseconds(pose: Callable[[Parameters], Tensor], start: Parameters) -> fl
 
 
 def draw_effort(runs: list[Run], path: Path) -> None:
-    """Error of seen joints against seconds, a line for each solver with its iterations written beside it."""
+    """Draw the error of seen joints against seconds, the iterations written beside each point."""
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    for solver in dict.fromkeys(run.solver for run in runs):
-        efforts = sorted({run.iterations for run in runs if run.solver == solver})
-        points = [
-            _effort_point([r for r in runs if (r.solver, r.iterations) == (solver, n)]) for n in efforts
-        ]
-        axes.plot(*zip(*points, strict=True), marker="o", label=solver)
-        for iterations, point in zip(efforts, points, strict=True):
-            axes.annotate(str(iterations), point, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    efforts = sorted({run.iterations for run in runs})
+    points = [_effort_point([run for run in runs if run.iterations == effort]) for effort in efforts]
+    axes.plot(*zip(*points, strict=True), marker="o")
+    for iterations, point in zip(efforts, points, strict=True):
+        axes.annotate(str(iterations), point, textcoords="offset points", xytext=(4, 4), fontsize=8)
     axes.set(xscale="log", xlabel="seconds per 100 frames", ylabel="seen joints, mm (aligned at one joint)")
-    axes.legend()
     figure.savefig(path, dpi=150, metadata={"Software": None})
 
 

@@ -66,7 +66,7 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
+class TrueClip:
     """Detections of T frames and the truth behind them.
 
     Attributes:
@@ -127,7 +127,7 @@ def load_stage(folder: Path = BODY_FOLDER) -> Stage:
     return Stage(body, load_landmarks(body, folder))
 
 
-def make_clips(spec: MannequinSpec, stage: Stage, detectors: tuple[str, ...]) -> list[Clip]:
+def make_clips(spec: MannequinSpec, stage: Stage, detectors: tuple[str, ...]) -> list[TrueClip]:
     """One motion, filmed once, as several detectors see it.
 
     Args:
@@ -150,7 +150,7 @@ def make_clips(spec: MannequinSpec, stage: Stage, detectors: tuple[str, ...]) ->
         seer = dataclasses.replace(spec, detector="heatmap" if name == REGRESSOR else name)
         keypoints = detect(seer, camera, filming.places, filming.point_states)
         start = regressed(truth, camera, spec.seed) if name == REGRESSOR else None
-        clips.append(Clip(spec, name, keypoints, cameras, truth, vertices, seen, start))
+        clips.append(TrueClip(spec, name, keypoints, cameras, truth, vertices, seen, start))
     return clips
 
 
@@ -181,7 +181,7 @@ def _seen_surface(camera: Camera, body: BodyModel, vertices: Tensor) -> Tensor:
     return torch.from_numpy(seen_vertices(camera, depth, vertices, _SURFACE_DEPTH))
 
 
-def measure(identity: Identity, poses: Poses, clip: Clip, stage: Stage) -> Errors:
+def measure(identity: Identity, poses: Poses, clip: TrueClip, stage: Stage) -> Errors:
     """How far a fitted body and its motion are from the truth of their clip."""
     vertices, joints = pose_body(stage.body, identity, poses.rotation, poses.expression, poses.transl)
     true, seen = clip.joints, clip.joint_seen

@@ -28,6 +28,7 @@ import torch
 from pipeline.artifact import Artifact
 from pipeline.body import (
     joint_transforms,
+    linear_blend_skinning,
     load_body,
     load_landmarks,
     locate,
@@ -36,11 +37,11 @@ from pipeline.body import (
     read_poses,
     rest_joints,
     rest_vertices,
-    skin,
 )
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
 from pipeline.frames import read_mask
-from pipeline.job import Job, job_from_words, run_stage
+from pipeline.job import Job, open_job, run_stage
 from pipeline.keypoints import read_keypoints
 from pipeline.records import read_cameras
 from pipeline.workspace import open_workspace
@@ -170,7 +171,7 @@ def _job(words: dict[str, str], number: int) -> Job:
         "ingest.camera_name": f"cam0{number}",
         "ingest.test_fraction": "0",
     }
-    return job_from_words("balance", {**own, **words})
+    return open_job("balance", parse_request({**own, **words}, "balance"))
 
 
 def _made(job: Job, stage: str) -> Artifact:
@@ -250,11 +251,11 @@ def _fitted_points(job: Job, frames: np.ndarray) -> np.ndarray:
         read_poses(folder / "poses.parquet"),
     )
     joints = rest_joints(body, identity)
-    rows = torch.tensor([poses.index(int(frame)) for frame in frames])
-    rotation, transl = poses.rotation[rows], poses.transl[rows][:, None]
+    chosen = poses.select(int(frame) for frame in frames)
+    rotation, transl = chosen.rotation, chosen.transl[:, None]
     transforms = joint_transforms(rotation, joints, body.parents)
     rest = rest_vertices(body, identity)[vertex_ids]
-    vertices = skin(transforms, body.skinning_weights[vertex_ids], rest) + transl
+    vertices = linear_blend_skinning(transforms, body.skinning_weights[vertex_ids], rest) + transl
     posed = posed_joints(rotation, joints, body.parents) + transl
     return locate(points, posed, vertices).double().numpy()
 

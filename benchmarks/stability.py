@@ -31,8 +31,8 @@ from pipeline.avatar import save_avatar
 from pipeline.body import Poses, write_poses
 from pipeline.guard import finite, require_finite_files
 from pipeline.metrics import ssim
-from stages.fit import optimise, parameters
-from stages.fit.doubt import without_doubted
+from stages.fit import adam, parameters
+from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
 from stages.ingest.mannequin import MannequinSpec
@@ -158,7 +158,7 @@ def fitting(quick: bool, repeats: int) -> Iterator[Cost]:
         register(stage.body, stage.landmarks, clip.keypoints, clip.cameras, settings)
 
     def fit_unguarded() -> None:
-        with without(optimise, "require_finite_gradient", lambda *arguments: None):
+        with without(adam, "require_finite_gradient", lambda *arguments: None):
             fit()
 
     def fit_trusting() -> None:
@@ -169,11 +169,9 @@ def fitting(quick: bool, repeats: int) -> Iterator[Cost]:
     guarded, bare, trusting = least(turns, fit, fit_unguarded, fit_trusting)
     yield Cost("fit: gradients, one sum, every step", bare, guarded / bare - 1, True, "names step and frame")
     yield Cost("fit: six numbers that are no rotation", trusting, guarded / trusting - 1, True, "else NaN")
-    (doubt,) = least(turns, lambda: without_doubted(clip.keypoints))
+    (masking,) = least(turns, lambda: mask_outlier_frames(clip.keypoints))
     full = guarded * 200 / settings.iterations
-    yield Cost(
-        "fit: frames that are not believed, of 200 steps", full, doubt / full, True, "else 60 degrees off"
-    )
+    yield Cost("fit: outlier frames, of 200 steps", full, masking / full, True, "else 60 degrees off")
 
 
 def files(repeats: int) -> Iterator[Cost]:

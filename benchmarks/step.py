@@ -23,12 +23,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from benchmarks.avatars import Pose, avatar_camera, avatar_of, poses_of
+from benchmarks.avatars import avatar_camera, avatar_of, poses_of
 from benchmarks.machine import described, prepare
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.body import Pose
 from pipeline.camera import Camera
+from pipeline.composite import over
+from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
 from stages.train.regularisers import unmixed
@@ -183,13 +186,13 @@ class Contestant:
     def pose(self, decoded: Decoded, frame: Frame) -> Posed:
         """The frame's Gaussians."""
         if isinstance(self.model, Avatar) and self.seen:
-            return self.model.pose(decoded, *frame.pose.values(), rows=frame.seen)
-        return self.model.pose(decoded, *frame.pose.values())
+            return self.model.pose(decoded, frame.pose, rows=frame.seen)
+        return self.model.pose(decoded, frame.pose)
 
 
 def _photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Tensor:
-    image = losses.over(rendering.color, rendering.alpha, background)
-    return 0.8 * losses.l1(image, target) + 0.2 * losses.ssim(image, target)
+    image = over(rendering.color, rendering.alpha, background)
+    return 0.8 * losses.l1(image, target) + 0.2 * ssim_loss(image, target)
 
 
 def _regularisers(decoded: Decoded, posed: Posed) -> Tensor:
@@ -214,7 +217,7 @@ def frames_of(avatar: Avatar, count: int, size: int) -> list[Frame]:
     for pose in poses_of(avatar, count):
         target = torch.rand(size, size, 3, generator=generator)
         background = torch.rand(3, generator=generator)
-        weights = render(avatar.pose(decoded, *pose.values()).gaussians, camera).weights
+        weights = render(avatar.pose(decoded, pose).gaussians, camera).weights
         frames.append(Frame(pose, camera, target, background, torch.nonzero(weights)[:, 0]))
     return frames
 

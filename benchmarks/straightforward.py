@@ -20,7 +20,7 @@ from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE
 from pipeline.avatar.canonical import HEAD
 from pipeline.avatar.heads import GroupNormReLU, Head
 from pipeline.avatar.triplane import PLANES, Triplane, normalise
-from pipeline.body import joint_transforms, skin, vertex_normals
+from pipeline.body import Pose, joint_transforms, linear_blend_skinning, vertex_normals
 from pipeline.splat import Gaussians
 
 
@@ -100,9 +100,10 @@ class StraightforwardAvatar(nn.Module):
         offset = geometry[:, :3] * self.architecture.offset_unit
         return Decoded(self.surface, features, offset, geometry[:, 3:], self.base_color + color)
 
-    def pose(self, decoded: Decoded, rotation: Tensor, expression: Tensor, transl: Tensor) -> Posed:
+    def pose(self, decoded: Decoded, pose: Pose) -> Posed:
         """As ``Avatar.pose``."""
         sizes, canonical = self.architecture, self.surface.canonical
+        rotation, expression = pose.rotation, pose.expression
         transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)
         rest = canonical.vertices + canonical.expression_directions[..., : len(expression)] @ expression
         if canonical.pose_directions is not None:
@@ -110,7 +111,7 @@ class StraightforwardAvatar(nn.Module):
             rest = rest + canonical.pose_directions @ correctives
         shape = rest + decoded.offset
         with torch.no_grad():
-            posed = skin(transforms, canonical.skinning_weights, shape)[0]
+            posed = linear_blend_skinning(transforms, canonical.skinning_weights, shape)[0]
             normals = vertex_normals(posed, canonical.faces)
         theta = pose_features(rotation)
         geometry = self.pose_geometry(decoded.features, theta)
@@ -119,7 +120,8 @@ class StraightforwardAvatar(nn.Module):
         log_scale = decoded.log_scale + 0.5 * geometry[:, 3:]
         color_logit = decoded.color_logit + color
         gaussians = Gaussians(
-            means=skin(transforms, canonical.skinning_weights, shape + pose_offset)[0] + transl,
+            means=linear_blend_skinning(transforms, canonical.skinning_weights, shape + pose_offset)[0]
+            + pose.transl,
             quaternions=self._quaternions(transforms[0]),
             scales=self._scales(log_scale),
             colors=torch.sigmoid(color_logit),

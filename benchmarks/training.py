@@ -7,7 +7,7 @@ import dataclasses
 import io
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +15,18 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import load_body, read_poses
-from pipeline.camera import Camera
-from pipeline.frames import read_frame, read_mask
+from pipeline.body import load_body
+from pipeline.clip import FittedClip, read_fitted_clip
+from pipeline.composite import composite_frame
 from pipeline.job import Job
-from pipeline.keypoints import COUNT, FACE, LEFT_HAND, RIGHT_HAND, read_keypoints
-from pipeline.metrics.image import psnr
-from pipeline.metrics.protocol import composite, interior
-from pipeline.records import read_cameras, read_footage, read_split
+from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.metrics.protocol import interior
+from pipeline.metrics.psnr import psnr
+from pipeline.process import make_results
 from pipeline.splat import Rendering, render
 from pipeline.stage import Context
-from pipeline.study import made
 from stages.evaluate.baselines import nearest_frames
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 from stages.train import run as train
 
 CROPS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
@@ -56,7 +55,7 @@ def trained(job: Job, **instead: Path) -> Trained:
         job: whose avatar, and under which settings.
         instead: folders that stand in for upstream stages' published ones.
     """
-    upstream = made(job, job.stages["train"].needs)
+    upstream = make_results(job, job.stages["train"].needs)
     demands = job.stages["train"].demands(job.settings["train"])
     with tempfile.TemporaryDirectory() as folder:
         places = {name: Path(folder) / name for name in ("output", "work")}
@@ -82,52 +81,33 @@ def trained(job: Job, **instead: Path) -> Trained:
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
-    """Frames that an avatar is judged by.
+class JudgedClip:
+    """The frames that an avatar is judged by.
 
     Attributes:
-        ingest: where they lie.
-        cameras: a camera a frame.
-        pose: rotation, expression and translation of a frame, as fitted.
-        seconds: a frame's time, where it has one.
-        keypoints: a frame's [133, 3], x, y in pixels and score.
-        test: the held-out frames, at most as many as asked for, evenly spread.
+        clip: the fitted clip.
+        test: its held-out frames, at most as many as asked for, evenly spread.
     """
 
-    ingest: Path
-    cameras: Mapping[int, Camera]
-    pose: Callable[[int], tuple[Tensor, Tensor, Tensor]]
-    seconds: Mapping[int, float]
-    keypoints: Mapping[int, np.ndarray]
+    clip: FittedClip
     test: tuple[int, ...]
 
     @classmethod
-    def read(cls, ingest: Path, fit: Path, most: int) -> Clip:
+    def read(cls, ingest: Path, fit: Path, body_file: Path, most: int) -> JudgedClip:
         """Reads what ingest and fit published."""
-        cameras, poses = read_cameras(ingest / "cameras.parquet"), read_poses(fit / "poses.parquet")
-        rows = {frame: row for row, frame in enumerate(poses.frames)}
-        test = read_split(ingest / "split.json").test
-        step = max(1, -(-len(test) // most))
-        seconds = dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False))
-
-        found = read_keypoints(ingest / "keypoints.parquet")
-        keypoints = dict(zip(found.frames.tolist(), found.whole_body, strict=True))
-
-        def pose(frame: int) -> tuple[Tensor, Tensor, Tensor]:
-            row = rows[frame]
-            return poses.rotation[row], poses.expression[row], poses.transl[row]
-
-        return cls(ingest, cameras, pose, seconds, keypoints, test[::step])
+        clip = read_fitted_clip(ingest, fit, body_file)
+        step = max(1, -(-len(clip.split.test) // most))
+        return cls(clip, clip.split.test[::step])
 
     @torch.no_grad()
     def render(self, avatar: Avatar, frame: int) -> Rendering:
         """The avatar as a frame's camera sees it in that frame's fitted pose."""
-        gaussians = avatar.gaussians(*self.pose(frame), self.seconds.get(frame))
-        return render(gaussians, self.cameras[frame])
+        gaussians = avatar.gaussians(self.clip.pose(frame), self.clip.seconds.get(frame))
+        return render(gaussians, self.clip.cameras[frame])
 
     def person(self, frame: int) -> Tensor:
         """What was filmed, the person on black: [H, W, 3]."""
-        return composite(read_frame(self.ingest / "frames", frame), read_mask(self.ingest / "masks", frame))
+        return composite_frame(self.clip.frame(frame), self.clip.mask(frame))
 
     def scores(self, avatar: Avatar, scorer: Scorer) -> dict[str, float]:
         """Each metric's mean over the held-out frames, the person on black."""
@@ -135,7 +115,7 @@ class Clip:
 
     def nearest_scores(self, scorer: Scorer) -> dict[str, float]:
         """The same of the training frame that is most like each held-out one."""
-        training = read_split(self.ingest / "split.json").train
+        training = self.clip.split.train
         nearest = nearest_frames(self.person, training, self.test)
         return self.scores_of(lambda frame: self.person(nearest[frame]), scorer)
 
@@ -143,7 +123,7 @@ class Clip:
         """Each metric's mean over the held-out frames of what is shown at each, [H, W, 3] on black."""
         total: dict[str, list[float]] = {}
         for frame in self.test:
-            mask = read_mask(self.ingest / "masks", frame)
+            mask = self.clip.mask(frame)
             truth, shown = scorer.picture(self.person(frame)), scorer.picture(shown_at(frame))
             for name, value in scorer.values(shown, truth, interior(mask)).items():
                 total.setdefault(name, []).append(value)
@@ -154,8 +134,9 @@ class Clip:
 
     def crops(self, frame: int) -> dict[str, tuple[slice, slice]]:
         """Rows and columns around the face and around each hand, of those that were detected."""
-        points = self.keypoints.get(frame, np.zeros((COUNT, 3)))
-        size = read_mask(self.ingest / "masks", frame).shape
+        found = self.clip.keypoints
+        points = found.whole_body[found.index(frame)]
+        size = self.clip.mask(frame).shape
         found = {}
         for name, rows in CROPS.items():
             box = crop_box(points[rows], size)

@@ -20,18 +20,19 @@ import numpy as np
 import torch
 
 from benchmarks.machine import described, prepare
-from benchmarks.training import Clip, trained
+from benchmarks.training import JudgedClip, trained
 from pipeline.avatar import Avatar
+from pipeline.body import Pose
 from pipeline.camera import Camera
-from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.job import job_from_words
+from pipeline.composite import composite_frame
+from pipeline.config.request import parse_request
+from pipeline.frames import write_png
+from pipeline.job import open_job
 from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
-from pipeline.metrics.protocol import composite
-from pipeline.records import read_split
+from pipeline.process import make_results
 from pipeline.splat import Gaussians, render
-from pipeline.study import made
 from pipeline.turntable import orbit, visible_extent
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}
@@ -63,14 +64,14 @@ class Row:
     seconds: float
 
 
-def sides(avatar: Avatar, clip: Clip) -> np.ndarray:
+def sides(avatar: Avatar, clip: JudgedClip) -> np.ndarray:
     """Eight sides of the avatar about the vertical, beginning at the front: [H, W, 3] uint8."""
     frame = clip.test[len(clip.test) // 2]
-    rotation, expression, transl = clip.pose(frame)
-    upright = rotation.clone()
+    pose = clip.clip.pose(frame)
+    upright = pose.rotation.clone()
     upright[0] = 0
     with torch.no_grad():
-        gaussians = avatar.gaussians(upright, expression, torch.zeros_like(transl))
+        gaussians = avatar.gaussians(Pose(upright, pose.expression, torch.zeros_like(pose.transl)))
         cameras = orbit(visible_extent(gaussians), *SIZE, SIDES)
         return np.hstack([shown(gaussians, camera) for camera in cameras])
 
@@ -82,7 +83,7 @@ def shown(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return (255 * image.clamp(0, 1)).round().byte().numpy()
 
 
-def faces_of(reader: FaceReader, clip: Clip, avatar: Avatar) -> tuple[list[float], list[float]]:
+def faces_of(reader: FaceReader, clip: JudgedClip, avatar: Avatar) -> tuple[list[float], list[float]]:
     """Distance and cosine of the held-out frames' faces and the rendered ones."""
     distances, cosines = [], []
     for frame in clip.test:
@@ -95,15 +96,15 @@ def faces_of(reader: FaceReader, clip: Clip, avatar: Avatar) -> tuple[list[float
     return distances, cosines
 
 
-def person(clip: Clip, frame: int) -> np.ndarray:
+def person(clip: JudgedClip, frame: int) -> np.ndarray:
     """The person of a frame on black, [H, W, 3] uint8."""
-    image = composite(read_frame(clip.ingest / "frames", frame), read_mask(clip.ingest / "masks", frame))
+    image = composite_frame(clip.clip.frame(frame), clip.clip.mask(frame))
     return (255 * image).round().byte().numpy()
 
 
-def own_distance(reader: FaceReader, clip: Clip) -> float:
+def own_distance(reader: FaceReader, clip: JudgedClip) -> float:
     """How far the filmed faces of held-out frames lie from that of the middle training frame."""
-    train = read_split(clip.ingest / "split.json").train
+    train = clip.clip.split.train
     middle = reader.read(person(clip, train[len(train) // 2]))
     others = [reader.read(person(clip, frame)) for frame in clip.test]
     if middle is None:
@@ -118,10 +119,10 @@ def mean(values: list[float]) -> float:
 
 def try_way(subject: str, way: str, words: dict[str, str]) -> tuple[Row, np.ndarray]:
     """Trains one way on one subject; its numbers and its sides."""
-    job = job_from_words(subject, {**words, **WAYS[way]})
-    folders = {name: one.folder for name, one in made(job, job.stages["train"].needs).items()}
+    job = open_job(subject, parse_request({**words, **WAYS[way]}, subject))
+    folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
     done = trained(job)
-    clip = Clip.read(folders["ingest"], folders["fit"], HELD_OUT)
+    clip = JudgedClip.read(folders["ingest"], folders["fit"], job.workspace.body_file, HELD_OUT)
     reader = FaceReader(*(job.workspace.assets / asset for asset in ASSETS))
     distances, cosines = faces_of(reader, clip, done.avatar)
     psnr = clip.scores(done.avatar, Scorer({}))["psnr"]

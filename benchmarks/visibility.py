@@ -27,15 +27,17 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, job_from_words
+from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
 from pipeline.plan import EFFECTS, Plan, read_plan
 from pipeline.splat import render
 from pipeline.visibility import evidence_threshold
-from stages.plan.measure import read_clip, visibility
+from stages.plan.measure import read_inputs, visibility
 from stages.train import run as training
 from stages.train.apply_plan import apply_plan
+from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
@@ -60,14 +62,14 @@ class Subject:
     Attributes:
         name: the subject's.
         job: with every stage's settings.
-        inputs: what train reads.
+        data: what train reads.
         plan: of the subject.
         clip: what the plan looked at.
     """
 
     name: str
     job: Job
-    inputs: training.Inputs
+    data: TrainingData
     plan: Plan
     folders: Mapping[str, Path]
 
@@ -78,7 +80,7 @@ def open_subject(name: str) -> Subject:
     Raises:
         UserError: the store has no plan of it under the present settings.
     """
-    job = job_from_words(name, {})
+    job = open_job(name, parse_request({}, name))
     folders = {}
     for stage in ("ingest", "fit", "plan"):
         artifact = job.find(stage)
@@ -89,32 +91,32 @@ def open_subject(name: str) -> Subject:
         settings=TrainSettings(), inputs=folders, body_file=job.workspace.body_file, log=lambda line: None
     )
     plan = read_plan(folders["plan"] / "plan.json")
-    return Subject(name, job, training.read_inputs(context), plan, folders)
+    return Subject(name, job, read_training_data(context), plan, folders)
 
 
 def trainer_of(subject: Subject, settings: TrainSettings, plan: Plan | None = None) -> Trainer:
     """A trainer as the stage makes it."""
     settings = settings if plan is None else apply_plan(settings, plan)
     context = SimpleNamespace(inputs=subject.folders, log=lambda line: None)
-    refinement = PoseRefinement(subject.inputs.poses, subject.inputs.split.train)
-    avatar, texture = training.prepare(subject.inputs, refinement, settings, context)
-    vertices = len(subject.inputs.body.v_template)
+    clip = subject.data.clip
+    refinement = PoseRefinement(clip.poses, clip.split.train)
+    avatar, data = training.prepare(subject.data, refinement, settings, context)
+    vertices = len(clip.body.v_template)
     gate = VisibilityGate(avatar, vertices, settings) if settings.gate else None
-    return Trainer(avatar, refinement, subject.inputs.evidence(texture), settings, gate=gate)
+    return Trainer(avatar, refinement, data, settings, gate=gate)
 
 
 def scored(subject: Subject, trainer: Trainer, frames: tuple[int, ...], network: Lpips) -> dict[str, float]:
     """Held-out PSNR, SSIM and LPIPS of the person on black, and an animation's frame."""
     values: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": [], "animation_ms": []}
     avatar = trainer.avatar.eval()
-    poses = subject.inputs.poses
+    clip = subject.data.clip
     with torch.no_grad():
         for frame in frames:
-            row, view = poses.index(frame), subject.inputs.whole[frame]
-            pose = (poses.rotation[row], poses.expression[row], poses.transl[row])
-            avatar.gaussians(*pose, subject.inputs.times.get(frame))
+            pose, view = clip.pose(frame), subject.data.whole[frame]
+            avatar.gaussians(pose, clip.seconds.get(frame))
             start = time.perf_counter()
-            gaussians = avatar.gaussians(*pose, subject.inputs.times.get(frame))
+            gaussians = avatar.gaussians(pose, clip.seconds.get(frame))
             values["animation_ms"].append(1e3 * (time.perf_counter() - start))
             image, truth = render(gaussians, view.camera).color.clamp(0, 1), view.composite(torch.zeros(3))
             values["psnr"].append(psnr(image, truth))
@@ -151,7 +153,7 @@ def in_turn(trainers: Mapping[str, Trainer], rounds: int) -> dict[str, float]:
 
 def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> list[dict[str, Any]]:
     """Trains every variant of one subject and scores it."""
-    frames = training.spread(subject.inputs.split.test, options.frames)
+    frames = subject.data.clip.spread(options.frames, "test")
     trainers, rows = {}, []
     for name in options.variants:
         forced = name == "forced"
@@ -179,8 +181,8 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
 
 def threshold_of(subject: Subject) -> dict[str, Any]:
     """The gate's threshold, from fitted poses."""
-    clip = read_clip(subject.folders["ingest"], subject.folders["fit"], subject.inputs.body)
-    scores, _ = visibility(clip)
+    inputs = read_inputs(subject.folders["ingest"], subject.folders["fit"], subject.job.workspace.body_file)
+    scores, _ = visibility(inputs)
     return {"subject": subject.name, **dataclasses.asdict(evidence_threshold(scores))}
 
 

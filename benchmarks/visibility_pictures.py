@@ -16,8 +16,8 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import joint_transforms
 from pipeline.camera import Camera, facing_camera, project
+from pipeline.composite import composite_frame
 from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.metrics import composite
 from pipeline.records import read_cameras
 from pipeline.splat import Rendering, render
 from pipeline.visibility import body_in_frame
@@ -44,9 +44,8 @@ def unseen_error(subject: Any, trainer: Trainer, folder: Path | None) -> dict[st
         return found
     total, pixels = 0.0, 0
     for frame, camera in read_cameras(views / "cameras.parquet").items():
-        row = subject.inputs.poses.index(frame)
-        rendering, seen = _rendered(subject, trainer, row, camera)
-        truth = composite(read_frame(views / "frames", frame), read_mask(views / "masks", frame))
+        rendering, seen = _rendered(subject, trainer, frame, camera)
+        truth = composite_frame(read_frame(views / "frames", frame), read_mask(views / "masks", frame))
         total += float((rendering.color.clamp(0, 1) - truth).abs().mean(-1)[~seen].sum())
         pixels += int((~seen).sum())
     return found | {"outside": total / max(1, pixels)}
@@ -54,10 +53,10 @@ def unseen_error(subject: Any, trainer: Trainer, folder: Path | None) -> dict[st
 
 def ghost(subject: Any, trainer: Trainer, folder: Path | None) -> float:
     """Alpha outside the seen region, summed over the pixels of one wide view."""
-    row = subject.inputs.poses.index(subject.inputs.split.test[0])
+    frame = subject.data.clip.split.test[0]
     camera = facing_camera(256, 256, 1.2 * 256)
     wide = dataclasses.replace(camera, translation=camera.translation + torch.tensor([0.0, 0.0, BACK]))
-    rendering, seen = _rendered(subject, trainer, row, wide)
+    rendering, seen = _rendered(subject, trainer, frame, wide)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         image = rendering.color + (1 - rendering.alpha[..., None]) * 0.82
@@ -67,17 +66,13 @@ def ghost(subject: Any, trainer: Trainer, folder: Path | None) -> float:
 
 
 @torch.no_grad()
-def _rendered(subject: Any, trainer: Trainer, row: int, camera: Camera) -> tuple[Rendering, Tensor]:
+def _rendered(subject: Any, trainer: Trainer, frame: int, camera: Camera) -> tuple[Rendering, Tensor]:
     """The avatar from a camera, and the pixels near a vertex that some training frame had in its picture."""
-    poses, avatar = subject.inputs.poses, trainer.avatar.eval()
-    rendering = render(
-        avatar.gaussians(poses.rotation[row], poses.expression[row], poses.transl[row]), camera
-    )
+    pose, avatar = subject.data.clip.pose(frame), trainer.avatar.eval()
+    rendering = render(avatar.gaussians(pose), camera)
     avatar.train()
     seen = _seen_vertices(subject)
-    vertices = seen["surface"].rig.place(
-        *seen["pose"](poses.rotation[row]), poses.transl[row]
-    )[0][seen["often"]]  # fmt: skip
+    vertices = seen["surface"].rig.place(*seen["pose"](pose.rotation), pose.transl)[0][seen["often"]]
     marks = np.zeros((camera.height, camera.width), np.uint8)
     for column, line in project(camera, vertices).round().int().tolist():
         if 0 <= column < camera.width and 0 <= line < camera.height:
@@ -88,22 +83,19 @@ def _rendered(subject: Any, trainer: Trainer, row: int, camera: Camera) -> tuple
 
 def _seen_vertices(subject: Any) -> dict[str, Any]:
     """The body's surface, and which of its vertices at least a tenth of the training frames show."""
-    inputs = subject.inputs
+    clip = subject.data.clip
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
-    surface = Avatar(inputs.body, inputs.identity, torch.arange(len(inputs.body.v_template)), bare).surfaces[
-        0
-    ]
+    everything = torch.arange(len(clip.body.v_template))
+    surface = Avatar(clip.body, clip.identity, everything, bare).surfaces[0]
     hits = torch.zeros(len(surface.canonical))
-    for frame in inputs.split.train:
-        row = inputs.poses.index(frame)
-        camera = inputs.crops.camera(frame)
-        hits += body_in_frame(surface, inputs.poses.rotation[row], inputs.poses.transl[row], camera)
+    for frame in clip.split.train:
+        hits += body_in_frame(surface, clip.pose(frame), subject.data.crops.camera(frame))
 
     def pose(rotation: Tensor) -> tuple[Tensor, Tensor]:
         canonical = surface.canonical
         return joint_transforms(rotation[None], canonical.joints, canonical.parents)[0], canonical.vertices
 
-    return {"surface": surface, "pose": pose, "often": hits >= 0.1 * len(inputs.split.train)}
+    return {"surface": surface, "pose": pose, "often": hits >= 0.1 * len(clip.split.train)}
 
 
 def gradient_picture(

@@ -25,6 +25,7 @@ from pipeline import digest, seal
 from pipeline.errors import UserError
 from pipeline.explain import is_disk_full
 from pipeline.guard import require_finite_files
+from pipeline.json_files import write_json
 
 MANIFEST = "manifest.json"
 RUN = "run.json"
@@ -322,11 +323,6 @@ def describe_file(root: Path, path: Path) -> dict[str, Any]:
         "size": path.stat().st_size,
         "sha256": digest.of_file(path),
     }
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Writes JSON for people and programs: sorted, indented, refusing NaN."""
-    path.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def make_folder(folder: Path) -> None:

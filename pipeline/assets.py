@@ -26,8 +26,9 @@ from packaging.tags import sys_tags
 from packaging.utils import InvalidWheelFilename, parse_wheel_filename
 
 from pipeline import digest
-from pipeline.artifact import size_of, write_json
+from pipeline.artifact import size_of
 from pipeline.errors import UserError
+from pipeline.json_files import write_json
 from pipeline.settings import near, read_toml
 from pipeline.workspace import Workspace, open_workspace
 

@@ -22,11 +22,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic.dataclasses import dataclass
+
 from pipeline import assets as third_party
+from pipeline.config.request import Processors, Request
 from pipeline.errors import UserError
-from pipeline.job import DEFAULT_PRESET, PLACES, Job, job_from_words, preset_path, workspace_from_words
+from pipeline.job import Job, open_job, preset_path
 from pipeline.process import run_stage_process
-from pipeline.settings import convert, read_toml
+from pipeline.settings import SETTINGS, read_fields, read_toml
 from pipeline.stage import Stage, usual
 from pipeline.summary import Outcome, summary_lines
 from pipeline.workspace import REPOSITORY
@@ -36,7 +39,7 @@ WAIT_SECONDS = 10.0  # between lines that say what is still running
 LOCAL = "127.0.0.1"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class Resources:
     """What a subject is given.
 
@@ -44,40 +47,32 @@ class Resources:
         cpus, gpus: whole machines' worth of none; a GPU may be shared, 0.5.
     """
 
-    cpus: float
-    gpus: float
+    cpus: Processors = 1.0
+    gpus: Processors = 0.0
 
 
-def resources_of(words: Mapping[str, str]) -> Resources:
+def resources_of(request: Request) -> Resources:
     """What the preset asks for; ``cpus=`` and ``gpus=`` on the command line replace it.
 
     Raises:
-        UserError: a number is missing or makes no sense.
+        UserError: there is no such preset, or its numbers make no sense.
     """
-    name = words.get("preset", DEFAULT_PRESET)
-    table = read_toml(preset_path(workspace_from_words(words), name)).get("resources", {})
-    found = {}
-    for key, default in (("cpus", 1), ("gpus", 0)):
-        value = words.get(key, table.get(key, default))
-        try:
-            found[key] = convert(value, float)
-        except (TypeError, ValueError):
-            found[key] = -1.0
-        if not 0 <= found[key] <= 10_000:
-            raise UserError(f"{key}={value}: it must be a number of {key.upper()} for a subject")
-    return Resources(**found)
+    path = preset_path(request.workspace, request.preset)
+    asked = read_fields(Resources, read_toml(path).get("resources", {}), str(path), "resources.")
+    given = {"cpus": request.cpus, "gpus": request.gpus}
+    return Resources(**{**asked, **{name: value for name, value in given.items() if value is not None}})
 
 
-def run_subject(subject: str, words: Mapping[str, str]) -> Outcome:
+def run_subject(subject: str, request: Request) -> Outcome:
     """Everything that a subject lacks, a stage after the other; runs wherever Ray puts it."""
     start = time.monotonic()
     at = ""
     try:
-        for at in way(job_from_words(subject, words).stages):
+        for at in way(open_job(subject, request).stages):
             # A job of its own: what it has looked at is remembered, and changes when a stage is done.
-            if is_current(job_from_words(subject, words), at):
+            if is_current(open_job(subject, request), at):
                 continue
-            reason = run_stage_process(at, subject, words)
+            reason = run_stage_process(at, subject, request)
             if reason:
                 return Outcome(subject, at, reason, time.monotonic() - start)
     except UserError as error:
@@ -101,12 +96,12 @@ def is_current(job: Job, stage: str) -> bool:
         return False
 
 
-def run_batch(subjects: Sequence[str], words: Mapping[str, str]) -> list[Outcome]:
+def run_batch(subjects: Sequence[str], request: Request) -> list[Outcome]:
     """Runs subjects on a cluster and says on this terminal how it goes.
 
     Args:
         subjects: who.
-        words: the command line's, ``cluster`` and ``preset`` among them.
+        request: the command line's.
 
     Returns:
         An outcome a subject, in their order.
@@ -115,17 +110,16 @@ def run_batch(subjects: Sequence[str], words: Mapping[str, str]) -> list[Outcome
         UserError: Ray is not installed, there is no such cluster, it cannot give what the preset asks
             for, or an asset cannot be fetched.
     """
-    ray = import_ray(words.get("cluster", "auto"))
-    carried = shared_words(words)
-    fetch_assets(subjects, carried)
-    with connected(ray, words.get("cluster", "auto")):
-        asked = fitting(ray, resources_of(words))
+    ray = import_ray(request.cluster)
+    fetch_assets(subjects, request)
+    with connected(ray, request.cluster):
+        asked = fitting(ray, resources_of(request))
         each = f"{asked.cpus:g} CPUs and {asked.gpus:g} GPUs"
         print(f"batch: {len(subjects)} subjects, {each} each, {shape(ray)}", flush=True)
         task = ray.remote(
             num_cpus=asked.cpus, num_gpus=asked.gpus, max_retries=RETRIES, scheduling_strategy="SPREAD"
         )(run_subject)
-        pending = {task.options(name=subject).remote(subject, carried): subject for subject in subjects}
+        pending = {task.options(name=subject).remote(subject, request): subject for subject in subjects}
         outcomes = collect(ray, pending)
     ordered = [outcomes[subject] for subject in subjects]
     print("\n".join(["", *summary_lines(ordered)]), flush=True)
@@ -161,29 +155,13 @@ def import_ray(cluster: str) -> Any:
     return ray
 
 
-def shared_words(words: Mapping[str, str]) -> dict[str, str]:
-    """The words for a stage's process on any machine: every place under its full path."""
-    workspace = workspace_from_words(words)
-    places = {
-        "data": workspace.data, "artifacts": workspace.artifacts, "assets": workspace.assets,
-        "body": workspace.body_file, "stages": workspace.stages,
-    }  # fmt: skip
-    own = ("subject", "cluster", "cpus", "gpus", *PLACES)
-    carried = {name: value for name, value in words.items() if name not in own}
-    if "source" in carried:
-        carried["source"] = str(Path(carried["source"]).absolute())
-    if "subject" not in words:  # then it only says which subjects; each names its own in its file
-        carried.pop("dataset", None)
-    return {**carried, **{name: str(place) for name, place in places.items()}}
-
-
-def fetch_assets(subjects: Sequence[str], words: Mapping[str, str]) -> None:
+def fetch_assets(subjects: Sequence[str], request: Request) -> None:
     """Fetches what the subjects need once, before any machine asks for it."""
-    workspace = workspace_from_words(words)
+    workspace = request.workspace
     wanted: set[str] = set()
     for subject in subjects:
         try:
-            job = job_from_words(subject, words)
+            job = open_job(subject, request)
             wanted.update(name for stage in way(job.stages) for name in job.needed_assets(stage))
         except UserError:
             continue  # the subject itself reports it

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import torch
 from torch import Tensor
 
+from pipeline.config.choices import Device
 from pipeline.errors import UserError
 
-DEVICES = ("auto", "cpu", "cuda")
 Record = TypeVar("Record")
 
 
@@ -31,8 +31,8 @@ def resolve(word: str) -> torch.device:
     Raises:
         UserError: a GPU is asked for and torch finds none.
     """
-    if word not in DEVICES:
-        raise ValueError(f"a device is one of {', '.join(DEVICES)}, not {word}")
+    if word not in get_args(Device):
+        raise ValueError(f"a device is one of {', '.join(get_args(Device))}, not {word}")
     found = torch.cuda.is_available()
     if word == "cuda" and not found:
         build = "was built for the CPU" if torch.version.cuda is None else "finds no GPU that it can use"

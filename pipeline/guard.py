@@ -2,8 +2,8 @@
 
 What is looked at, and where: the loss terms and gradients of every step of training and of every step of the
 fit, the parameters at every checkpoint, every column of every table (``tables.write_table``), every number of
-every JSON file (``records.write_json``), masks and scored pictures, and every array file of a version before
-it is published (``require_finite_files``). What each look costs is in docs/stability.md.
+every JSON file (``json_files.write_json``), masks and scored pictures, and every array file of a version
+before it is published (``require_finite_files``). What each look costs is in docs/stability.md.
 
 A look is one sum: NaN and infinities survive every sum. Only where the sum is not finite are the numbers
 looked at one by one, since finite ones may have overflowed together.

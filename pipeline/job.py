@@ -17,19 +17,14 @@ from typing import Any
 from pipeline import assets as third_party
 from pipeline import digest
 from pipeline.artifact import Artifact, Store, clear
+from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.settings import Layer, as_dict, command_line_layer, convert, near, read_toml, resolve
+from pipeline.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
 from pipeline.stage import Context, Loan, Stage, load_stages
 from pipeline.subjects import Subject, load_subject, require_footage
-from pipeline.workspace import Workspace, open_workspace
+from pipeline.workspace import Workspace
 
-# Words of the command line that are no stage's settings.
-PLACES = ("data", "artifacts", "assets", "body", "stages")
-OF_ONE_SUBJECT = ("source", "dataset")
-STUDIES = ("budget", "scale")  # for pipeline.studies alone
-WORDS = ("subject", "preset", "source", "dataset", "cluster", "cpus", "gpus", "verify", *STUDIES, *PLACES)
 NOT_SETTINGS = ("title", "resources")  # what a preset's file holds besides settings
-DEFAULT_PRESET = "quick"
 
 Found = dict[str, Artifact | None]
 
@@ -39,24 +34,24 @@ class Job:
     """One subject with everything decided.
 
     Attributes:
-        workspace: where things lie.
+        request: the command line that asks for it, about this subject alone.
         stages: every stage, upstream first.
         subject: who, and the footage.
         settings: stage name -> its settings object.
-        words: the command line that says all this, for starting a stage's process.
-        thorough: believe no version in the store before all of it was read.
     """
 
-    workspace: Workspace
+    request: Request
     stages: Mapping[str, Stage]
     subject: Subject
     settings: Mapping[str, Any]
-    words: tuple[str, ...]
-    thorough: bool = False
+
+    @property
+    def workspace(self) -> Workspace:
+        return self.request.workspace
 
     @property
     def store(self) -> Store:
-        return Store(self.workspace.artifacts, self.thorough)
+        return Store(self.workspace.artifacts, self.request.verify)
 
     @functools.cached_property
     def source_digest(self) -> str:
@@ -108,16 +103,15 @@ class Job:
         }
 
     def lent(self, name: str, loan: Loan) -> Artifact:
-        """The result of another subject that a stage reads: the one that these words give, else the latest.
+        """The result of another subject that a stage reads: what is asked for here, else the latest.
 
         Raises:
             UserError: there is none.
         """
         own = loan.subject == self.subject.name
-        words = {key: value for key, value in words_to_dict(self.words).items() if key not in OF_ONE_SUBJECT}
         artifact, reason = None, ""
         try:
-            artifact = (self if own else job_from_words(loan.subject, words)).find(loan.stage)
+            artifact = (self if own else open_job(loan.subject, self.request)).find(loan.stage)
         except (
             UserError
         ) as error:  # no such subject, or its footage is not there any more; its results may be
@@ -156,6 +150,13 @@ class Job:
             self.store.settle(artifact)
         return artifact is not None
 
+    def upstream_first(self, wanted: Iterable[str]) -> list[str]:
+        """Some stages and all that they need, in the order in which they run."""
+        found = set(wanted)
+        for name in reversed(list(self.stages)):
+            found |= set(self.stages[name].needs) if name in found else set()
+        return [name for name in self.stages if name in found]
+
     def needed_assets(self, name: str) -> list[str]:
         """The assets that a stage needs, its footage's included."""
         demands = self.stages[name].demands(self.settings[name])
@@ -173,54 +174,11 @@ def wanted_keys(job: Job) -> dict[str, str]:
 
     Whole inputs, that is: a damaged manifest would lead to another key.
     """
-    keys, job = {}, dataclasses.replace(job, thorough=True)
+    keys, job = {}, dataclasses.replace(job, request=dataclasses.replace(job.request, verify=True))
     for name in job.stages:
         with contextlib.suppress(UserError):
             keys[name] = key_of(job.description(name))
     return keys
-
-
-def words_to_dict(words: Iterable[str]) -> dict[str, str]:
-    """``["train.seed=3"]`` as ``{"train.seed": "3"}``.
-
-    Raises:
-        UserError: a word has no '='.
-    """
-    pairs = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals:
-            raise UserError(f"'{word}' is not of the form NAME=VALUE")
-        pairs[name] = value
-    return pairs
-
-
-def spelled_out(words: Mapping[str, str], stages: Mapping[str, Stage]) -> dict[str, str]:
-    """The words with the stage's name before those settings that may stand without it.
-
-    Raises:
-        UserError: a setting is named both ways.
-    """
-    full = {word: f"{name}.{word}" for name, stage in stages.items() for word in stage.words}
-    twice = [word for word in words if full.get(word) in words]
-    if twice:
-        raise UserError(f"the command line: {twice[0]} and {full[twice[0]]} are the same setting")
-    return {full.get(word, word): value for word, value in words.items()}
-
-
-def check_words(words: Mapping[str, str], stages: Mapping[str, Stage]) -> None:
-    """Refuses a word that is neither a setting nor one of ``WORDS``, showing the near names."""
-    settings = [
-        f"{name}.{field.name}"
-        for name, stage in stages.items()
-        for field in dataclasses.fields(stage.settings)
-    ]
-    for word in words:
-        if "." not in word and word not in WORDS:
-            short = [word for stage in stages.values() for word in stage.words]
-            raise UserError(
-                f"the command line: there is no '{word}'{near(word, [*WORDS, *short, *settings])}"
-            )
 
 
 def preset_layer(workspace: Workspace, name: str) -> Layer:
@@ -245,56 +203,37 @@ def preset_path(workspace: Workspace, name: str) -> Path:
     return path
 
 
-def setting_layers(workspace: Workspace, words: Mapping[str, str], subject: Subject | None) -> list[Layer]:
+def setting_layers(request: Request, subject: Subject | None) -> list[Layer]:
     """The layers of settings, the weakest first."""
-    overrides = {name: value for name, value in words.items() if "." in name}
-    layers = [preset_layer(workspace, words.get("preset", DEFAULT_PRESET))]
-    return [*layers, *(subject.layers if subject else ()), command_line_layer(overrides)]
+    layers = [preset_layer(request.workspace, request.preset)]
+    return [*layers, *(subject.layers if subject else ()), command_line_layer(request.overrides)]
 
 
-def is_thorough(words: Mapping[str, str]) -> bool:
-    """What ``verify=`` says; false where it is not there."""
-    try:
-        return bool(convert(words.get("verify", "false"), bool))
-    except ValueError:
-        raise UserError(f"verify={words['verify']}: it must be true or false") from None
-
-
-def workspace_from_words(words: Mapping[str, str]) -> Workspace:
-    """The workspace that the command line names, or this checkout's."""
-    return open_workspace(**{place: words[place] for place in PLACES if place in words})
-
-
-def check_command_line(words: Mapping[str, str]) -> None:
-    """Refuses wrong names and values on the command line before anything runs.
+def check_settings(request: Request) -> None:
+    """Refuses wrong settings of preset and command line before anything runs.
 
     Raises:
-        UserError: says which, and shows the near names.
+        UserError: says which, and shows the near names or the range.
     """
-    workspace = workspace_from_words(words)
-    stages = load_stages(workspace.stages)
-    words = spelled_out(words, stages)
-    check_words(words, stages)
-    is_thorough(words)
-    resolve({name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, None))
+    stages = load_stages(request.workspace.stages)
+    resolve({name: stage.settings for name, stage in stages.items()}, setting_layers(request, None))
 
 
-def job_from_words(subject: str, words: Mapping[str, str]) -> Job:
-    """The job of one subject under a command line's words.
+def open_job(subject: str, request: Request) -> Job:
+    """The job of one subject.
+
+    Args:
+        subject: whose.
+        request: the command line's; its footage and dataset count where it names the subject.
 
     Raises:
         UserError: a name, a value or a file is wrong.
     """
-    workspace = workspace_from_words(words)
-    stages = load_stages(workspace.stages)
-    words = spelled_out(words, stages)
-    check_words(words, stages)
-    who = load_subject(workspace, subject, words.get("source"), words.get("dataset"))
-    settings = resolve(
-        {name: stage.settings for name, stage in stages.items()}, setting_layers(workspace, words, who)
-    )
-    passed = tuple(f"{name}={value}" for name, value in words.items() if name != "subject")
-    return Job(workspace, stages, who, settings, passed, is_thorough(words))
+    request = request.about(subject)
+    stages = load_stages(request.workspace.stages)
+    who = load_subject(request.workspace, subject, request.source, request.dataset)
+    kinds = {name: stage.settings for name, stage in stages.items()}
+    return Job(request, stages, who, resolve(kinds, setting_layers(request, who)))
 
 
 def run_stage(job: Job, name: str) -> Artifact:

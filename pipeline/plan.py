@@ -13,10 +13,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from pipeline.config.choices import BodyPart
 from pipeline.errors import UserError
-from pipeline.records import read_json, write_json
+from pipeline.json_files import write_json
+from pipeline.records import read_json
 
 GATHERED = ("structure_from_motion", "face_registration")
 """Decided by ingest and by fit, which publish what the plan needs to know of it."""
@@ -35,18 +37,7 @@ DECIDED = (
 )
 """Decided by the plan stage, which has a setting (``on``, ``off`` or ``auto``) of each name."""
 
-# The parts in pipeline/body/parts.py, written out: a test compares them.
-SEEN_PARTS = (
-    "seen_torso",
-    "seen_head",
-    "seen_face",
-    "seen_left_arm",
-    "seen_right_arm",
-    "seen_left_hand",
-    "seen_right_hand",
-    "seen_left_leg",
-    "seen_right_leg",
-)
+SEEN_PARTS = tuple(f"seen_{part}" for part in get_args(BodyPart))
 """Whether a part of the body is ever seen; measured as the share of training frames that show it."""
 
 EFFECTS = (*GATHERED, *DECIDED, *SEEN_PARTS)

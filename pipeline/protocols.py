@@ -14,42 +14,32 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
+
+from pipeline.config.choices import Background, ProtocolName, Refinement, RenderMask
 
 AUTO = "auto"
-BACKGROUNDS = ("black", "white")
-"""What a person can be composited on; their values are in :mod:`pipeline.metrics.protocol`."""
-
-OWN, TRUTH = RENDER_MASKS = ("own", "truth")
-"""Whose alpha cuts the avatar's picture out: its own, or the truth's mask after it."""
-
-PLAN, ON, OFF = REFINEMENTS = ("plan", "on", "off")
-"""Whether held-out poses are refined on the held-out images: as the plan says, always, never."""
+OWN, TRUTH = get_args(RenderMask)
+PLAN, ON, OFF = get_args(Refinement)
 
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """A set of choices.
+    """A set of choices."""
 
-    Attributes:
-        background: one of ``BACKGROUNDS``.
-        render_mask: one of ``RENDER_MASKS``.
-        refine_test_poses: one of ``REFINEMENTS``.
-    """
-
-    background: str
-    render_mask: str
-    refine_test_poses: str
+    background: Background
+    render_mask: RenderMask
+    refine_test_poses: Refinement
 
 
-PROTOCOLS: Mapping[str, Protocol] = {
+PROTOCOLS: Mapping[ProtocolName, Protocol] = {
     "ours": Protocol("black", OWN, PLAN),
     "paper": Protocol("white", TRUTH, ON),  # its NeuMan table
     "paper_black": Protocol("black", TRUTH, OFF),  # its TalkShow and ZJU-MoCap tables
 }
 """The protocols by name. ``ours`` lets a silhouette that is wrong cost something."""
 
-DEFAULT = "ours"
+DEFAULT: ProtocolName = "ours"
 
 
 def chosen(settings: Mapping[str, Any]) -> Protocol:
@@ -57,22 +47,7 @@ def chosen(settings: Mapping[str, Any]) -> Protocol:
 
     Args:
         settings: of evaluate, as a table; what is missing is ``auto``.
-
-    Raises:
-        ValueError: a word that does not exist.
     """
-    name = settings.get("protocol", DEFAULT)
-    _check("protocol", name, tuple(PROTOCOLS))
-    known = {"background": BACKGROUNDS, "render_mask": RENDER_MASKS, "refine_test_poses": REFINEMENTS}
-    choices = {}
-    for choice, words in known.items():
-        word = settings.get(choice, AUTO)
-        _check(choice, word, (AUTO, *words))
-        if word != AUTO:
-            choices[choice] = word
-    return dataclasses.replace(PROTOCOLS[name], **choices)
-
-
-def _check(setting: str, word: Any, words: tuple[str, ...]) -> None:
-    if word not in words:
-        raise ValueError(f"evaluate.{setting} must be one of {', '.join(words)}, not {word}")
+    words = {field.name: settings.get(field.name, AUTO) for field in dataclasses.fields(Protocol)}
+    choices = {choice: word for choice, word in words.items() if word != AUTO}
+    return dataclasses.replace(PROTOCOLS[settings.get("protocol", DEFAULT)], **choices)

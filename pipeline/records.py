@@ -10,7 +10,6 @@ world-to-camera with OpenCV axes as in :mod:`pipeline.camera`.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ import torch
 
 from pipeline.camera import Camera
 from pipeline.errors import UserError
-from pipeline.guard import NotFiniteError, not_finite_in
+from pipeline.json_files import write_json
 from pipeline.tables import read_table, vectors, write_table
 from pipeline.untrusted import parse_json
 
@@ -85,13 +84,6 @@ class Split:
 
     train: tuple[int, ...]
     test: tuple[int, ...]
-
-
-def spread(frames: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """At most ``count`` of the frames, evenly spread over them; the first is always among them."""
-    if len(frames) <= count:
-        return frames
-    return tuple(frames[place * len(frames) // count] for place in range(count))
 
 
 def write_split(path: Path, split: Split) -> None:
@@ -164,18 +156,6 @@ def read_footage(path: Path) -> Footage:
     if not isinstance(value, dict) or set(value) != names:
         raise UserError(f"{path}: its fields are not {', '.join(sorted(names))}: {_REMEDY}")
     return Footage(**{**value, "seconds": tuple(value["seconds"])})
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON with sorted keys.
-
-    Raises:
-        NotFiniteError: a number is not finite; names its place.
-    """
-    place = not_finite_in(value)
-    if place is not None:
-        raise NotFiniteError(f"{path.name}: {place} is not finite")
-    path.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path, remedy: str) -> Any:

@@ -1,26 +1,60 @@
 """Typed settings: stage defaults < preset < dataset < subject < command line.
 
-Every stage declares one frozen dataclass. A layer is a mapping of stage name to a mapping of field
-name to value, as a TOML file gives it; the command line gives text, which is read as the field's
-type. Everything is checked here, once, and passed down as frozen objects.
+Every stage declares one frozen pydantic dataclass; the type of a field holds its range::
+
+    @dataclass(frozen=True, config=SETTINGS)
+    class TrainSettings:
+        iterations: Iterations = setting(1000, "optimiser steps")
+        skinning: Literal["own", "nearest"] = setting("own", "whose skinning weights a Gaussian has")
+
+A layer is a mapping of stage name to a mapping of field name to value, as a TOML file gives it; the command
+line gives text, which is read as the field's type. Everything is checked here, once, and passed down as
+frozen objects. Nothing heavy is imported: the DAG reads settings, too.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
+import functools
 import tomllib
-import types
-import typing
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipeline.errors import UserError
 
+SETTINGS = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+"""Of every settings class: no other fields, no other types, finite numbers only."""
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+Weight = Annotated[float, Field(ge=0, le=1e9)]
+LearningRate = Annotated[float, Field(gt=0, le=10)]
+Angle = Annotated[float, Field(ge=-3.2, le=3.2)]  # radians
+FrameRate = Annotated[float, Field(gt=0, le=1000)]  # frames a second
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+CountOrNone = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Frames = Annotated[int, Field(ge=1, le=100_000)]  # that are made, not chosen
+FramesOrNone = Annotated[int, Field(ge=0, le=100_000)]
+Iterations = Annotated[int, Field(ge=1, le=10_000_000)]
+Side = Annotated[int, Field(ge=32, le=8192)]  # pixels
+EvenSide = Annotated[int, Field(ge=16, le=8192, multiple_of=2)]  # pixels; H.264 halves them for its colours
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+NotEmpty = Annotated[str, Field(pattern=r"\S")]
+
 Tables = Mapping[str, Mapping[str, Any]]
+Schema = Mapping[str, Any]
 TRUE = ("true", "yes", "on", "1")
 FALSE = ("false", "no", "off", "0")
+
+
+def setting(default: Any, meaning: str) -> Any:
+    """A field of a settings class: its default, and its meaning in a line."""
+    return Field(default, description=meaning)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,10 +90,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: is not valid TOML: {error}") from error
 
 
-def command_line_layer(words: Mapping[str, str]) -> Layer:
-    """The layer of words such as ``train.iterations=2000``."""
+def command_line_layer(overrides: Mapping[str, str]) -> Layer:
+    """The layer of overrides such as ``train.iterations=2000``."""
     tables: dict[str, dict[str, str]] = {}
-    for name, text in words.items():
+    for name, text in overrides.items():
         stage, _, field = name.partition(".")
         tables.setdefault(stage, {})[field] = text
     return Layer("the command line", tables)
@@ -69,7 +103,7 @@ def resolve(declared: Mapping[str, type], layers: Sequence[Layer]) -> dict[str, 
     """The settings of every stage after all layers.
 
     Args:
-        declared: stage name -> settings dataclass.
+        declared: stage name -> settings class.
         layers: the weakest first.
 
     Raises:
@@ -80,94 +114,135 @@ def resolve(declared: Mapping[str, type], layers: Sequence[Layer]) -> dict[str, 
     for layer in layers:
         for stage, table in layer.tables.items():
             check_names(declared, layer.origin, stage, table)
-            for field, value in table.items():
-                merged[stage][field] = read_value(declared[stage], stage, field, value, layer.origin)
+            if table:
+                merged[stage] |= read_fields(declared[stage], table, layer.origin, f"{stage}.")
                 origin[stage] = layer.origin
-    settings = {}
-    for stage, kind in declared.items():
-        try:
-            settings[stage] = kind(**merged[stage])
-        except ValueError as error:
-            raise UserError(f"{origin[stage]}: {error}") from error
-    return settings
+    return {stage: build(kind, merged[stage], origin[stage]) for stage, kind in declared.items()}
 
 
 def check_names(declared: Mapping[str, type], origin: str, stage: str, table: Mapping[str, Any]) -> None:
     """Refuses a table or a field that no stage declares, showing the near names."""
     if stage not in declared or not isinstance(table, Mapping):
         raise UserError(f"{origin}: there is no setting '{stage}'{near(stage, declared)}")
-    known = [f"{stage}.{field.name}" for field in dataclasses.fields(declared[stage])]
     for field in table:
-        if f"{stage}.{field}" not in known:
-            others = [
-                f"{other}.{one.name}" for other, kind in declared.items() for one in dataclasses.fields(kind)
-            ]
+        if field not in schemas(declared[stage]):
+            others = [f"{other}.{one}" for other, kind in declared.items() for one in schemas(kind)]
             raise UserError(
                 f"{origin}: there is no setting '{stage}.{field}'{near(f'{stage}.{field}', others)}"
             )
 
 
-def read_value(kind: type, stage: str, field: str, value: Any, origin: str) -> Any:
-    """One value as its field's type; text is read, numbers are checked.
+def read_fields(kind: type, table: Mapping[str, Any], origin: str, prefix: str = "") -> dict[str, Any]:
+    """The values of some fields of a settings class as the fields' types, each within its range.
+
+    Args:
+        kind: the class.
+        table: field -> value, or text.
+        origin: where the values come from, for messages.
+        prefix: what stands before the field's name in messages.
 
     Raises:
-        UserError: the value does not fit.
+        UserError: a value does not fit; names the field, its range and the value.
     """
-    expected = typing.get_type_hints(kind)[field]
+    values = {name: read(value, schemas(kind)[name]) for name, value in table.items()}
     try:
-        return convert(value, expected)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{origin}: {stage}.{field} must be {describe(expected)}, not {value!r}") from error
+        kind(**values)
+    except ValidationError as error:
+        for one in error.errors():
+            if one["loc"]:  # else it is about several fields, of which this table may hold only some
+                name = str(one["loc"][0])
+                raise UserError(
+                    f"{origin}: {prefix}{name} {refusal(table[name], schemas(kind)[name])}"
+                ) from None
+    return values
 
 
-def convert(value: Any, expected: Any) -> Any:
-    """``value`` as ``expected``: bool, int, float, str, tuple[T, ...] or T | None.
+def build(kind: type, values: Mapping[str, Any], origin: str) -> Any:
+    """A settings object; UserError, which begins with ``origin``, where its fields do not fit each other."""
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UserError(f"{origin}: {first.get('ctx', {}).get('error', first['msg'])}") from None
 
-    Raises:
-        ValueError, TypeError: it cannot be read so without losing something.
-    """
-    if typing.get_origin(expected) in (typing.Union, types.UnionType):
-        options = [option for option in typing.get_args(expected) if option is not type(None)]
-        if value is None or (isinstance(value, str) and value.lower() in ("none", "")):
+
+def refusal(value: Any, schema: Schema) -> str:
+    """``must be ..., not VALUE``, with the near words where the field takes words."""
+    shown = value if isinstance(value, str) and value.strip() else repr(value)
+    return f"must be {describe(schema)}, not {shown}{near(str(value), words_of(schema))}"
+
+
+@functools.cache
+def schemas(kind: type) -> dict[str, Schema]:
+    """Field -> the JSON schema of its type, default and meaning, in the class's order."""
+    properties: dict[str, Schema] = TypeAdapter(kind).json_schema()["properties"]
+    return properties
+
+
+def read(value: Any, schema: Schema) -> Any:
+    """``value``, which may be text, as the type of a field; what cannot be read comes back as it is."""
+    if "anyOf" in schema:
+        options = [option for option in schema["anyOf"] if option.get("type") != "null"]
+        if len(options) < len(schema["anyOf"]) and str(value).lower() in ("none", ""):
             return None
-        return convert(value, options[0])
-    if typing.get_origin(expected) is tuple:
-        items = value.split(",") if isinstance(value, str) else list(value)
-        return tuple(convert(item, typing.get_args(expected)[0]) for item in items if item != "")
-    return convert_scalar(value, expected)
-
-
-def convert_scalar(value: Any, expected: type) -> Any:
-    """``value`` as a bool, int, float or str."""
-    if expected is bool:
-        text = str(value).lower()
-        if text not in TRUE + FALSE:
-            raise ValueError(text)
-        return text in TRUE
-    if isinstance(value, bool):
-        raise TypeError("a truth value is not a number")
-    if expected is int:
-        number = float(value)
-        if number != int(number):
-            raise ValueError(value)
-        return int(number)
-    if expected is float:
-        return float(value)
-    if not isinstance(value, str):
-        raise TypeError(value)
+        return read(value, options[0])
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if schema["type"] == "array":
+            items = value.split(",") if isinstance(value, str) else list(value)
+            return tuple(read(item, schema["items"]) for item in items if item != "")
+        if schema["type"] == "boolean":
+            return {**dict.fromkeys(TRUE, True), **dict.fromkeys(FALSE, False)}.get(str(value).lower(), value)
+        if schema["type"] in ("integer", "number") and not isinstance(value, bool):
+            number = float(value)
+            return int(number) if schema["type"] == "integer" and number == int(number) else number
     return value
 
 
-def describe(expected: Any) -> str:
-    """A type in a user's words."""
-    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-    if typing.get_origin(expected) is tuple:
-        return f"a list such as a,b of {describe(typing.get_args(expected)[0])}"
-    if typing.get_origin(expected) in (typing.Union, types.UnionType):
-        return " or ".join(
-            "none" if part is type(None) else describe(part) for part in typing.get_args(expected)
-        )
-    return names.get(expected, str(expected))
+def describe(schema: Schema) -> str:
+    """A field's type and range in a user's words."""
+    if "anyOf" in schema:
+        return " or ".join(describe(option) for option in schema["anyOf"])
+    if "enum" in schema:
+        return f"one of {', '.join(str(word) or repr(word) for word in schema['enum'])}"
+    kind = schema["type"]
+    if kind == "array":
+        least = "not empty, " if schema.get("minItems") else ""
+        return f"a list such as a,b, {least}each {describe(schema['items'])}"
+    if kind == "string" and "pattern" in schema:
+        return f"text like {schema['examples'][0]}" if "examples" in schema else "text that is not empty"
+    names = {"null": "none", "boolean": "true or false", "string": "text"}
+    return names[kind] if kind in names else describe_number(schema)
+
+
+def describe_number(schema: Schema) -> str:
+    """``a whole number from 1 to 10``, ``a number more than 0 and at most 1``."""
+    step = {None: "", 2: "even "}[schema.get("multipleOf")]
+    noun = f"{'an' if step else 'a'} {step}{'whole ' if schema['type'] == 'integer' else ''}number"
+    if "minimum" in schema and "maximum" in schema:
+        return f"{noun} from {schema['minimum']:.10g} to {schema['maximum']:.10g}"
+    sides = {
+        "exclusiveMinimum": "more than", "minimum": "at least",
+        "exclusiveMaximum": "less than", "maximum": "at most",
+    }  # fmt: skip
+    limits = [f"{word} {schema[side]:.10g}" for side, word in sides.items() if side in schema]
+    return f"{noun} {' and '.join(limits)}" if limits else noun
+
+
+def words_of(schema: Schema) -> list[str]:
+    """The words that a field takes; none where it takes numbers or any text."""
+    parts = [*schema.get("anyOf", ()), schema.get("items", {})]
+    return [str(word) for part in (schema, *parts) for word in part.get("enum", ())]
+
+
+def help_lines(kind: type, stage: str) -> list[str]:
+    """A line for each setting of a stage: its name, default, type, range and meaning."""
+    lines = []
+    for name, schema in schemas(kind).items():
+        default = schema["default"]
+        text = ",".join(map(str, default)) if isinstance(default, list) else str(default)
+        text = text.lower() if default is None or isinstance(default, bool) else text
+        lines.append(f"{stage}.{name}={text}: {describe(schema)}; {schema['description']}")
+    return lines
 
 
 def as_dict(settings: Any) -> dict[str, Any]:

@@ -1,27 +1,21 @@
-"""What a stage is, and running one: ``python -m pipeline.stage fit --subject oliver train.seed=3``.
+"""What a stage is: its declaration, what it asks for and what it is given.
 
 A stage is declared in ``stages/<name>/__init__.py`` as ``STAGE`` and found there by its name, so that
-this package needs no import of any stage. Each run is a process of its own: a crash or an
-out-of-memory kill ends one stage, memory goes back, and the same line works under any scheduler.
+this package needs no import of any stage.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import importlib
-import os
 import pkgutil
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.explain import explain
-from pipeline.settings import near
+from pipeline.run.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +59,7 @@ class Stage:
     Attributes:
         name: the folder under ``stages`` and the name in the store.
         version: raised by hand when the same inputs would give another result.
-        settings: a frozen dataclass; its defaults are the ``quick`` preset's.
+        settings: a frozen pydantic dataclass; its defaults are the ``quick`` preset's.
         run: ``"module:function"``, imported only in the stage's own process.
         needs: upstream stage -> patterns of its files that this stage reads. Only those files'
             digests enter the key, so a change to any other does not make this stage stale.
@@ -112,13 +106,12 @@ class Stage:
 
     def named_paths(self, settings: Any) -> dict[str, Path]:
         """The files and folders that settings other than the defaults name."""
-        defaults = {field.name: field.default for field in dataclasses.fields(self.settings)}
         values = {name: getattr(settings, name) for name in self.path_settings}
         words = {"", *self.path_words}
         given = {
             name: Path(value)
             for name, value in values.items()
-            if value not in words and value != defaults[name]
+            if value not in words and value != getattr(self.settings, name)
         }
         return {name: path for name, path in given.items() if path.exists()}
 
@@ -153,38 +146,6 @@ def usual(stages: Mapping[str, Stage]) -> list[str]:
     return [name for name, stage in stages.items() if not stage.on_request]
 
 
-class Progress:
-    """A bar with ETA on a terminal; elsewhere a line at most every ten seconds."""
-
-    QUIET_SECONDS = 10.0
-
-    def __init__(self, total: int, label: str) -> None:
-        from tqdm import tqdm
-
-        self.total, self.label, self.done = total, label, 0
-        self.start = self.last = time.monotonic()
-        self.bar = tqdm(total=total, desc=label, unit="", dynamic_ncols=True) if sys.stderr.isatty() else None
-
-    def advance(self, steps: int = 1, note: str = "") -> None:
-        """Counts ``steps`` more as done; ``note`` is shown beside the bar."""
-        self.done += steps
-        if self.bar is not None:
-            if note:
-                self.bar.set_postfix_str(note, refresh=False)
-            self.bar.update(steps)
-            return
-        now = time.monotonic()
-        if now - self.last >= self.QUIET_SECONDS:
-            self.last = now
-            left = (now - self.start) / max(self.done, 1) * (self.total - self.done)
-            print(f"{self.label}: {self.done}/{self.total}, {left:.0f} s left {note}".rstrip(), flush=True)
-
-    def close(self) -> None:
-        """Takes the bar away."""
-        if self.bar is not None:
-            self.bar.close()
-
-
 @dataclasses.dataclass(frozen=True)
 class Context:
     """What a stage's ``run`` is given.
@@ -217,9 +178,9 @@ class Context:
     loans: Mapping[str, Path] = dataclasses.field(default_factory=dict)
 
     @contextlib.contextmanager
-    def progress(self, total: int, label: str) -> Iterator[Progress]:
-        """A progress display for ``total`` steps."""
-        progress = Progress(total, f"{self.stage}:{self.subject} {label}")
+    def progress(self, total: int, label: str, costs: Sequence[float] | None = None) -> Iterator[Progress]:
+        """A progress display for ``total`` steps; ``costs`` are their relative costs, equal if None."""
+        progress = Progress(total, f"{self.stage}:{self.subject} {label}", costs)
         try:
             yield progress
         finally:
@@ -232,75 +193,3 @@ class Context:
     def timing(self, name: str, value: Any) -> None:
         """Notes something that differs between two equal runs (seconds, memory), for run.json."""
         self.timings[name] = value
-
-
-def parse_arguments(arguments: list[str]) -> argparse.Namespace:
-    """The command line of one stage."""
-    parser = argparse.ArgumentParser(
-        prog="python -m pipeline.stage", description="Run one stage for one subject."
-    )
-    parser.add_argument("stage")
-    parser.add_argument("--subject", required=True)
-    parser.add_argument(
-        "words",
-        nargs="*",
-        metavar="NAME=VALUE",
-        help="as after 'doit run': preset=, source=, train.seed= ...",
-    )
-    return parser.parse_intermixed_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Runs one stage; returns the exit status."""
-    from pipeline.job import job_from_words, run_stage, words_to_dict
-
-    options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
-    where = Path.cwd()
-    try:
-        job = job_from_words(options.subject, words_to_dict(options.words))
-        if options.stage not in job.stages:
-            raise UserError(f"there is no stage '{options.stage}'{near(options.stage, job.stages)}")
-        where = job.workspace.artifacts
-        run_stage(job, options.stage)
-    except KeyboardInterrupt:
-        print(
-            f"{options.stage}:{options.subject} stopped; the same command goes on from here", file=sys.stderr
-        )
-        return 130
-    except Exception as error:
-        message = explain(error, where)
-        leave_reason(message or f"{type(error).__name__}: {error} (a defect; its traceback is above)")
-        if message is None:
-            raise
-        print(f"{options.stage}:{options.subject} failed: {message}", file=sys.stderr, flush=True)
-        return 1
-    return 0
-
-
-REASON = "FLEXIAVATAR_REASON"
-"""Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
-
-
-def leave_reason(message: str) -> None:
-    """Leaves the reason of a failure where the starter looks for it, if there is one."""
-    if os.environ.get(REASON):
-        with contextlib.suppress(OSError):
-            Path(os.environ[REASON]).write_text(message, encoding="utf-8")
-
-
-def process_environment() -> dict[str, str]:
-    """The environment of a stage's process.
-
-    The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
-    zeroed pages at every step; they must be set before Python starts.
-    """
-    defaults = {
-        "MALLOC_MMAP_THRESHOLD_": "4294967296",
-        "MALLOC_TRIM_THRESHOLD_": "4294967296",
-        "MALLOC_TOP_PAD_": "268435456",
-    }
-    return {**defaults, **os.environ}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

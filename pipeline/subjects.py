@@ -58,7 +58,7 @@ def known_subjects(workspace: Workspace) -> tuple[str, ...]:
 
 
 def load_subject(
-    workspace: Workspace, name: str, source: str | None = None, dataset: str | None = None
+    workspace: Workspace, name: str, source: Path | None = None, dataset: str | None = None
 ) -> Subject:
     """Reads a subject's file, if it has one.
 
@@ -79,13 +79,13 @@ def load_subject(
                 f"doit run subject={name} source=CLIP.mp4{near(name, known_subjects(workspace))}"
             )
         layers = (load_dataset(workspace, dataset).layer,) if dataset else ()
-        return Subject(name, name, None, Path(source).absolute(), "", layers)
+        return Subject(name, name, None, source, "", layers)
     content = read_toml(path)
     return parse_subject(workspace, path, {**content, "dataset": dataset} if dataset else content, source)
 
 
 def parse_subject(
-    workspace: Workspace, path: Path, content: Mapping[str, Any], source: str | None
+    workspace: Workspace, path: Path, content: Mapping[str, Any], source: Path | None
 ) -> Subject:
     """The subject that a file's content describes."""
     tables = {name: value for name, value in content.items() if name not in ("title", "dataset", "source")}
@@ -112,11 +112,11 @@ def parse_subject(
 
 
 def find_footage(
-    workspace: Workspace, footage: Mapping[str, str], asset: str | None, source: str | None
+    workspace: Workspace, footage: Mapping[str, str], asset: str | None, source: Path | None
 ) -> Path | None:
     """Where the footage should lie, whether or not it is there."""
     if source is not None:
-        return Path(source).absolute()
+        return source
     if asset is not None:
         return workspace.assets / asset / footage.get("file", "")
     return workspace.data / footage["path"] if "path" in footage else None

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pipeline.artifact import MANIFEST, Artifact, Store, damaged_files, read_manifest
+from pipeline.config.request import Request
 from pipeline.errors import UserError
-
-WORD = "verify"  # of the command line: verify=true believes no version before all of it was read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,24 +47,24 @@ def damages(store: Store, subject: str, stages: Iterable[str]) -> list[Damage]:
     return [damage for damage in looked_at if damage.files]
 
 
-def remedy(damage: Damage, words: Mapping[str, str], wanted: Mapping[str, str]) -> str:
+def remedy(damage: Damage, request: Request, wanted: Mapping[str, str]) -> str:
     """What is damaged, and the command that makes it again.
 
     Args:
         damage: a damaged version.
-        words: the command line's, which the command repeats.
-        wanted: stage -> the key of the version that these words call for, where that is known.
+        request: the command line's, which the command repeats.
+        wanted: stage -> the key of the version that is asked for, where that is known.
     """
     others = f" and {len(damage.files) - 1} more of its files" if len(damage.files) > 1 else ""
     said = f"{damage.folder / damage.files[0]}{others}: damaged"
     stage, subject = damage.stage, damage.subject
     if wanted.get(stage, damage.folder.name) != damage.folder.name:
         return (
-            f"{said}; made by {stage} under other settings: rerun it with those and {WORD}=true, "
+            f"{said}; made by {stage} under other settings: rerun it with those and verify=true, "
             f"or delete the version: doit run prune:{subject}"
         )
-    again = {name: value for name, value in words.items() if name != WORD}
-    line = " ".join(shlex.quote(f"{name}={value}") for name, value in {**again, WORD: "true"}.items())
+    words = dataclasses.replace(request, verify=True).words()
+    line = " ".join(shlex.quote(f"{name}={value}") for name, value in words.items())
     return f"{said}; rerun the stage: doit run {stage}:{subject} {line}"
 
 
@@ -73,13 +72,13 @@ def verify(
     store: Store,
     subject: str,
     stages: Iterable[str],
-    words: Mapping[str, str] | None = None,
+    request: Request | None = None,
     wanted: Mapping[str, str] | None = None,
 ) -> int:
     """Reads every byte of a subject's versions; returns how many there are.
 
     Args:
-        words, wanted: as of ``remedy``.
+        request, wanted: as of ``remedy``.
 
     Raises:
         UserError: versions are damaged; a line each names the file, the stage to rerun and the command.
@@ -87,5 +86,5 @@ def verify(
     stages = tuple(stages)
     found = damages(store, subject, stages)
     if found:
-        raise UserError("\n".join(remedy(damage, words or {}, wanted or {}) for damage in found))
+        raise UserError("\n".join(remedy(damage, request or Request(), wanted or {}) for damage in found))
     return sum(len(store.folders(subject, stage)) for stage in stages)

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Surface
-from pipeline.body import joint_transforms
+from pipeline.body import Pose, joint_transforms
 from pipeline.camera import Camera, project, to_camera
 
 BINS = 256
@@ -71,20 +71,19 @@ def in_frame(camera: Camera, points: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def body_in_frame(surface: Surface, rotation: Tensor, transl: Tensor, camera: Camera) -> Tensor:
+def body_in_frame(surface: Surface, pose: Pose, camera: Camera) -> Tensor:
     """True for vertices of the posed body that lie in the picture, [N] bool.
 
     Expressions and offsets are left out: they move a vertex by less than its distance to the next.
 
     Args:
         surface: of an avatar.
-        rotation: [55, 3] rotation vectors, radians.
-        transl: [3], metres.
+        pose: of the body.
         camera: of the picture.
     """
     canonical = surface.canonical
-    transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
-    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, transl)[0])
+    transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, pose.transl)[0])
 
 
 def histogram(scores: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a worker a core; tests that are about
     import numba
     import torch
 
-    numba.get_num_threads()  # its pool sets torch's number of threads when it starts (pipeline.threads)
+    numba.get_num_threads()  # its pool sets torch's number of threads when it starts (pipeline.numba_kernels)
     torch.set_num_threads(1)
 
 

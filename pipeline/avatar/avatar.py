@@ -24,7 +24,7 @@ from pipeline.avatar.rows import put, take
 from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.surface import Surface, build_surface, plane_regions
 from pipeline.avatar.triplane import Triplane
-from pipeline.body import BodyModel, Identity, blend_transforms, joint_transforms
+from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
 from pipeline.device import autocast, moved
 from pipeline.splat import Gaussians
 
@@ -249,9 +249,7 @@ class Avatar(nn.Module):
     def pose(
         self,
         decoded: Decoded,
-        rotation: Tensor,  # [55, 3]
-        expression: Tensor,  # [E]
-        transl: Tensor,  # [3]
+        pose: Pose,
         noise: Tensor | None = None,  # [54 * 6]
         time: float | None = None,
         rows: Tensor | None = None,  # [M]
@@ -261,28 +259,26 @@ class Avatar(nn.Module):
 
         Args:
             decoded: the pose-independent part.
-            rotation: [55, 3] rotation vectors, radians, the SMPL-X order of joints.
-            expression: [E].
-            transl: [3], metres.
+            pose: of the frame.
             noise: added to what the heads are told of the pose; for training.
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
             rows: [M] int64, each at most once, the Gaussians that pose and residual heads are asked for;
                 all if None.
-            theta: what the heads are told of the pose, see ``pose_features``; that of ``rotation`` if None.
+            theta: what the heads are told of the pose, see ``pose_features``; that of ``pose`` if None.
         """
         canonical = decoded.surface.canonical
-        transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
+        transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
         blended = blend_transforms(transforms, canonical.skinning_weights)
-        shape = decoded.offset + _rest_shape(canonical, rotation, expression)
+        shape = decoded.offset + _rest_shape(canonical, pose)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
-        theta = pose_features(rotation.detach()) if theta is None else theta
+        theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
             normals = decoded.surface.rig.normals(transforms, shape)
             pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
-        means = _transform(blended, shape) + transl
+        means = transform_points(blended, shape) + pose.transl
         if self.residuals_active and decoded.surface.residual:
             with self._autocast():
                 answer = self.residuals(decoded.surface.residual, means, theta, time, rows)
@@ -290,7 +286,7 @@ class Avatar(nn.Module):
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
-            quaternions=decoded.surface.rig.place(transforms, shape, transl)[1],
+            quaternions=decoded.surface.rig.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, log_scale),
             colors=torch.sigmoid(color_logit),
             opacities=self._opacities(canonical),
@@ -331,9 +327,7 @@ class Avatar(nn.Module):
 
     def gaussians(
         self,
-        rotation: Tensor,  # [55, 3]
-        expression: Tensor,  # [E]
-        transl: Tensor,  # [3]
+        pose: Pose,
         time: float | None = None,
         theta: Tensor | None = None,  # [54 * 6]
     ) -> Gaussians:
@@ -343,36 +337,35 @@ class Avatar(nn.Module):
         Gradients reach the pose.
 
         Args:
-            rotation: [55, 3] rotation vectors, radians.
-            expression: [E].
-            transl: [3], metres.
+            pose: of the body, in the world.
             time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
                 the training frames' interval; None, as for a motion that was never filmed, gives what
                 the heads learnt to answer without a clock (see ``residual.py``).
-            theta: what the heads are told of the pose; that of ``rotation`` if None.
+            theta: what the heads are told of the pose; that of ``pose`` if None.
         """
         if self._baked is None:
             with torch.no_grad():
                 self._baked = self.decode()
-        seen = self.pose(self._baked, rotation, expression, transl, time=time, theta=theta).gaussians
+        seen = self.pose(self._baked, pose, time=time, theta=theta).gaussians
         if self.unseen == "nothing" or bool(self.active.all()):
             return seen
-        bare = self.bare(self.unseen_surface(), rotation, expression, transl)
+        bare = self.bare(self.unseen_surface(), pose)
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
-    def bare(self, surface: Surface, rotation: Tensor, expression: Tensor, transl: Tensor) -> Gaussians:
+    def bare(self, surface: Surface, pose: Pose) -> Gaussians:
         """The fitted body in its base colours, in a pose: what no network has a say in.
 
         Args:
             surface: which of its vertices.
-            rotation, expression, transl: as for ``gaussians``.
+            pose: as for ``gaussians``.
         """
         canonical = surface.canonical
-        transforms = joint_transforms(rotation[None], canonical.joints, canonical.parents)[0]
-        shape = _rest_shape(canonical, rotation, expression)
+        transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        blended = blend_transforms(transforms, canonical.skinning_weights)
+        shape = _rest_shape(canonical, pose)
         return Gaussians(
-            means=_transform(blend_transforms(transforms, canonical.skinning_weights), shape) + transl,
-            quaternions=surface.rig.place(transforms, shape, transl)[1],
+            means=transform_points(blended, shape) + pose.transl,
+            quaternions=surface.rig.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
             colors=torch.sigmoid(surface.pick(self.base_color)),
             opacities=self._opacities(canonical),
@@ -400,15 +393,12 @@ def pose_features(rotation: Tensor) -> Tensor:
     return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
 
 
-def _rest_shape(canonical: Canonical, rotation: Tensor, expression: Tensor) -> Tensor:
+def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:
     """The vertices before skinning: rest shape, expression and, if the body has them, correctives."""
-    shape = canonical.vertices + canonical.expression_directions[..., : len(expression)] @ expression
+    moved = canonical.expression_directions[..., : len(pose.expression)] @ pose.expression
+    shape = canonical.vertices + moved
     if canonical.pose_directions is None:
         return shape
-    matrices = roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3, device=rotation.device)
+    joints = pose.rotation[1:]
+    matrices = roma.rotvec_to_rotmat(joints) - torch.eye(3, device=joints.device)
     return shape + canonical.pose_directions @ matrices.reshape(-1)
-
-
-def _transform(blended: Tensor, points: Tensor) -> Tensor:
-    # A batched 3x3 product is many times slower on a CPU than the sum written out.
-    return (blended[..., :3] * points[:, None, :]).sum(-1) + blended[..., 3]

@@ -19,7 +19,7 @@ from pipeline.avatar.fused import Layers, arranged, arranged_rows, finish
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import encode, time_code
-from pipeline.body import joint_transforms
+from pipeline.body import Pose, joint_transforms
 from pipeline.splat import Gaussians
 
 
@@ -121,24 +121,20 @@ class BakedAvatar:
     @torch.no_grad()
     def gaussians(
         self,
-        rotation: Tensor,  # [55, 3]
-        expression: Tensor,  # [E]
-        transl: Tensor,  # [3]
+        pose: Pose,
         time: float | None = None,
         theta: Tensor | None = None,  # [54 * 6]
     ) -> Gaussians:
         """The avatar in a pose, world coordinates; as ``Avatar.gaussians``, without gradient.
 
         Args:
-            rotation: [55, 3] rotation vectors, radians.
-            expression: [E].
-            transl: [3], metres.
+            pose: of the body, in the world.
             time: seconds from the clip's start, or None, for the residual colours.
-            theta: what the heads are told of the pose; that of ``rotation`` if None.
+            theta: what the heads are told of the pose; that of ``pose`` if None.
         """
-        constants, theta = self.constants, pose_features(rotation) if theta is None else theta
-        transforms = joint_transforms(rotation[None], constants.joints, self.parents)[0]
-        points = self._rest_shape(rotation, expression)
+        constants, theta = self.constants, pose_features(pose.rotation) if theta is None else theta
+        transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
+        points = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         if self.geometry is not None and self.color is not None:
             normals = self.rig.normals(transforms, points)
@@ -146,12 +142,12 @@ class BakedAvatar:
             points = torch.addcmul(points, change[:, :3], constants.offset_unit)
             log_scale = log_scale + 0.5 * change[:, 3:]
             color_logit = color_logit + self.color(theta, normals)
-        means, quaternions = self.rig.place(transforms, points, transl)
+        means, quaternions = self.rig.place(transforms, points, pose.transl)
         answers = self._residuals(means, theta, time)
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
-            means, quaternions = self.rig.place(transforms, points, transl)
+            means, quaternions = self.rig.place(transforms, points, pose.transl)
         for rows, answer in answers:
             color_logit = color_logit.index_add(0, rows, answer[:, :3])
         scales = constants.scales * log_scale.clamp(*LOG_SCALE_RANGE).exp_()
@@ -163,15 +159,15 @@ class BakedAvatar:
             opacities=torch.full((len(points),), self.opacity),
         )
 
-    def _rest_shape(self, rotation: Tensor, expression: Tensor) -> Tensor:
+    def _rest_shape(self, pose: Pose) -> Tensor:
         """The points before skinning, a copy: [N, 3]."""
         constants = self.constants
-        moved = constants.expressions[..., : len(expression)] @ expression
+        moved = constants.expressions[..., : len(pose.expression)] @ pose.expression
         points = constants.points.index_add(0, constants.expressive, moved)
         if not len(constants.correctives):
             return points
-        pose = (roma.rotvec_to_rotmat(rotation[1:]) - torch.eye(3)).flatten()
-        return points + (constants.correctives @ pose.to(constants.correctives.dtype)).float()
+        turned = (roma.rotvec_to_rotmat(pose.rotation[1:]) - torch.eye(3)).flatten()
+        return points + (constants.correctives @ turned.to(constants.correctives.dtype)).float()
 
     def _residuals(self, means: Tensor, theta: Tensor, time: float | None) -> list[tuple[Tensor, Tensor]]:
         """Each part's rows and what its head says of them, [M, 3] logits or [M, 6] with moves."""

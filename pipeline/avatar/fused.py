@@ -17,7 +17,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -31,6 +30,7 @@ from pipeline.avatar.fused_kernels import (
     norm_relu_backward,
     sum_norm_relu,
 )
+from pipeline.numba_kernels import use_torch_threads
 
 ROWS = 4096  # at a time
 
@@ -148,11 +148,6 @@ def _norm_relu(z: Tensor, place: int, layers: Layers, y: Tensor) -> None:
     norm = bits(layers.norm_weights[place]), bits(layers.norm_biases[place])
     lanes = lanes_of(z.shape[1], layers.groups)
     norm_relu(bits(z), *norm, lanes, np.uint64(layers.groups), bits(y))
-
-
-def use_torch_threads() -> None:
-    """Gives numba as many threads as torch has: two pools of different sizes wait for each other."""
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
 class _Decode(torch.autograd.Function):

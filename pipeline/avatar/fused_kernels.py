@@ -11,10 +11,11 @@ import torch
 from numba.extending import overload
 from torch import Tensor
 
+from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel
+
 EPSILON = 1e-5
 MOST_LANES = 32
 CHUNKS = 16  # of rows; sums over rows are added up chunk by chunk, whatever the number of threads
-FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # never "nnan" or "ninf": what is not finite must show
 
 
 def lanes_of(channels: int, groups: int) -> np.uint64:
@@ -63,7 +64,7 @@ def _rounded(value, like):
 # Lane counts are run-time numbers and unsigned, or the loops would be unrolled before they are vectorised.
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _fold(sums, lanes, groups):
     """Adds up the lanes of each group, into the first ``groups`` places."""
     half = lanes
@@ -73,7 +74,7 @@ def _fold(sums, lanes, groups):
             sums[lane] += sums[lane + half]
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _spread(sums, lanes, groups):
     """Repeats the first ``groups`` places over all lanes."""
     half = groups
@@ -83,7 +84,7 @@ def _spread(sums, lanes, groups):
         half = half << np.uint64(1)
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _inverse_deviation(row, inverse, lanes, groups, channels):
     for lane in range(lanes):
         inverse[lane] = np.float32(0)
@@ -99,7 +100,7 @@ def _inverse_deviation(row, inverse, lanes, groups, channels):
     _spread(inverse, lanes, groups)
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _standardise(row, inverse, lanes, groups, channels):
     """Divides each group of a centred row by its deviation, in place."""
     _inverse_deviation(row, inverse, lanes, groups, channels)
@@ -110,7 +111,7 @@ def _standardise(row, inverse, lanes, groups, channels):
         first += lanes
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def norm_relu(x, weight, bias, lanes, groups, y):
     """``y = relu(group_norm(x))``, [N, C], float32 or bfloat16 as uint16; weight and bias [C] float32."""
     rows, channels = x.shape[0], np.uint64(x.shape[1])
@@ -126,7 +127,7 @@ def norm_relu(x, weight, bias, lanes, groups, y):
                 y[row, k] = rounded(np.float32(0) if value < 0 else value, x[row, k])
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def sum_norm_relu(products, shared, own, own_weight, weight, bias, lanes, groups, y):
     """``norm_relu`` of ``products + shared + own @ own_weight``."""
     rows, channels = products.shape[0], np.uint64(products.shape[1])
@@ -145,7 +146,7 @@ def sum_norm_relu(products, shared, own, own_weight, weight, bias, lanes, groups
                 y[row, k] = rounded(np.float32(0) if value < 0 else value, products[row, k])
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _standardise_backward(push, normal, inverse, along, lanes, groups, channels):
     """Turns the gradient of standardised values into that of the centred ones before, in place."""
     for lane in range(lanes):
@@ -167,7 +168,7 @@ def _standardise_backward(push, normal, inverse, along, lanes, groups, channels)
         first += lanes
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _affine_backward(push, normal, weight, sums):
     """Adds up the parameters' gradients, and turns that after scaling into that before, in place."""
     channels = np.uint64(len(push))
@@ -177,7 +178,7 @@ def _affine_backward(push, normal, weight, sums):
         push[k] *= weight[k]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def norm_relu_backward(x, gradient, weight, bias, lanes, groups, to_x, y, sums):
     """Gradients of ``norm_relu``'s ``x`` and, added to ``sums``, of weight, bias and all rows of x.
 

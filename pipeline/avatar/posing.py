@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
-from pipeline.avatar.fused import use_torch_threads
-from pipeline.avatar.fused_kernels import CHUNKS, FAST
-from pipeline.body import vertex_normals
+from pipeline.avatar.fused_kernels import CHUNKS
+from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
+from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads
 
 
 def joints_of_points(skinning_weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,33 +110,27 @@ class Rig:
 
 @torch.no_grad()
 def plain_normals(rig: Rig, transforms: Tensor, points: Tensor) -> Tensor:
-    """What ``Rig.normals`` computes, in plain torch."""
+    """The plain twin of ``Rig.normals``."""
     blended = _blended(rig, transforms)
-    return vertex_normals(_carried(blended, points), rig.faces.long())
+    return vertex_normals(transform_points(blended, points), rig.faces.long())
 
 
 @torch.no_grad()
 def plain_place(rig: Rig, transforms: Tensor, points: Tensor, transl: Tensor) -> tuple[Tensor, Tensor]:
-    """What ``Rig.place`` computes, in plain torch."""
+    """The plain twin of ``Rig.place``."""
     blended = _blended(rig, transforms)
     quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ rig.frames)
-    return _carried(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
+    return transform_points(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
 
 
 def _blended(rig: Rig, transforms: Tensor) -> Tensor:
     """The transform that each point is carried with, [N, 3, 4]."""
-    flat, total = transforms.flatten(1), transforms.new_zeros(len(rig.weights), 12)
-    # One joint after the other: [N, K, 12] is large.
-    for weight, joint in zip(rig.weights.unbind(1), rig.joints_of.long().unbind(1), strict=True):
-        total += weight[:, None] * flat[joint]
-    return total.unflatten(1, (3, 4))
+    weights = transforms.new_zeros(len(rig.weights), len(transforms))
+    weights.scatter_(1, rig.joints_of.long(), rig.weights.to(weights))
+    return blend_transforms(transforms, weights)
 
 
-def _carried(blended: Tensor, points: Tensor) -> Tensor:
-    return (blended[..., :3] * points[:, None]).sum(-1) + blended[..., 3]
-
-
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _blend(transforms, joints, weights, point, blended):
     for k in range(12):
         blended[k] = 0
@@ -146,7 +140,7 @@ def _blend(transforms, joints, weights, point, blended):
             blended[k] += weight * transforms[joint, k]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def skin_points(transforms, joints, weights, points, posed):
     """Rest points carried to their pose.
 
@@ -169,7 +163,7 @@ def skin_points(transforms, joints, weights, points, posed):
                 posed[i, row] = value
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def normals_of_vertices(vertices, faces, starts, around, normals):
     """Unit normals, area-weighted over the faces around each vertex, as ``pipeline.body.vertex_normals``.
 
@@ -198,7 +192,7 @@ def normals_of_vertices(vertices, faces, starts, around, normals):
             normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _write_quaternion(m, quaternion):
     """A nearly orthonormal matrix [3, 3] as a unit quaternion, wxyz, by the largest of its parts."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
@@ -221,7 +215,7 @@ def _write_quaternion(m, quaternion):
         quaternion[k] /= np.sqrt(square)
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def place_gaussians(transforms, joints, weights, points, frames, transl, means, quaternions):
     """Centres and orientations of the Gaussians in the world.
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
@@ -28,9 +29,10 @@ from torch import Tensor, nn
 from pipeline.avatar.canonical import Canonical
 from pipeline.avatar.heads import Head
 from pipeline.body import PARTS
+from pipeline.config.choices import ResidualPlace
 
 REST = "rest"  # what no other named part holds
-PLACES = ("canonical", "posed")
+PLACES: tuple[str, ...] = get_args(ResidualPlace)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,24 +14,28 @@ from pipeline.body.joints import JOINT_NAMES, joint_index
 from pipeline.body.landmarks import Landmarks, PointSet, load_landmarks, locate
 from pipeline.body.mesh import draw_mesh, edges, rasterize, uniform_laplacian, vertex_normals
 from pipeline.body.parts import PARTS, is_face, is_part, part_labels
-from pipeline.body.poses import Poses, read_poses, write_poses
+from pipeline.body.poses import Pose, Poses, read_poses, write_poses
 from pipeline.body.skinning import (
     blend_transforms,
+    forward_kinematics,
     joint_orientations,
     joint_transforms,
-    matrix_transforms,
+    linear_blend_skinning,
     pose_body,
+    pose_frame,
     pose_offsets,
     posed_joints,
-    skin,
+    posed_vertices,
+    transform_points,
 )
 from pipeline.body.subdivision import subdivide
 
 __all__ = [
-    "JOINT_NAMES", "PARTS", "BodyModel", "Identity", "Landmarks", "PointSet", "Poses", "blend_transforms",
-    "draw_mesh", "edges", "expression_offsets", "is_face", "is_part", "joint_index", "joint_orientations",
-    "joint_transforms", "load_body", "load_landmarks", "locate", "matrix_transforms", "mean_identity",
-    "part_labels", "pose_body", "pose_offsets", "posed_joints", "rasterize", "read_identity", "read_poses",
-    "rest_joints", "rest_vertices", "skin", "subdivide", "uniform_laplacian", "vertex_normals",
+    "JOINT_NAMES", "PARTS", "BodyModel", "Identity", "Landmarks", "PointSet", "Pose", "Poses",
+    "blend_transforms", "draw_mesh", "edges", "expression_offsets", "forward_kinematics", "is_face",
+    "is_part", "joint_index", "joint_orientations", "joint_transforms", "linear_blend_skinning",
+    "load_body", "load_landmarks", "locate", "mean_identity", "part_labels", "pose_body", "pose_frame",
+    "pose_offsets", "posed_joints", "posed_vertices", "rasterize", "read_identity", "read_poses",
+    "rest_joints", "rest_vertices", "subdivide", "transform_points", "uniform_laplacian", "vertex_normals",
     "write_identity", "write_poses",
 ]  # fmt: skip

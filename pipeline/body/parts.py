@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import torch
 from torch import Tensor
 
 from pipeline.body.body_model import BodyModel
 from pipeline.body.joints import JOINT_NAMES, joint_index
+from pipeline.config.choices import BodyPart
 
-PARTS: tuple[str, ...] = (
-    "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg",
-)  # fmt: skip
+PARTS: tuple[str, ...] = get_args(BodyPart)
 """Part names; a label is the index of its name. The head's label does not include the face."""
 
 

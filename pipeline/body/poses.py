@@ -1,8 +1,10 @@
-"""A clip's motion: a pose, an expression and a place for every frame, and their Parquet file."""
+"""One frame's pose, a clip's poses, and their Parquet file."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,27 @@ from pipeline.guard import NotFiniteError, rows_not_finite
 from pipeline.tables import open_table
 
 _JOINTS = len(JOINT_NAMES)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """One frame's pose.
+
+    Attributes:
+        rotation: theta, [55, 3], rotation vectors in radians relative to the parent joint, in the order of
+            ``JOINT_NAMES``; joint 0 is global_orient.
+        expression: psi, [E].
+        transl: [3], metres, added to the posed body.
+    """
+
+    rotation: Tensor  # [55, 3]
+    expression: Tensor  # [E]
+    transl: Tensor  # [3]
+
+    @property
+    def global_orient(self) -> Tensor:
+        """The root's rotation vector, [3], radians."""
+        return self.rotation[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +77,41 @@ class Poses:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @cached_property
+    def _rows(self) -> Mapping[int, int]:
+        return {frame: row for row, frame in enumerate(self.frames)}
+
     def index(self, frame: int) -> int:
         """The row of a frame number.
 
         Raises:
             ValueError: the clip has no such frame.
         """
-        return self.frames.index(frame)
+        row = self._rows.get(frame)
+        if row is None:
+            raise ValueError(f"there is no pose of frame {frame}")
+        return row
+
+    def pose(self, frame: int) -> Pose:
+        """The pose of a frame number; ValueError as of ``index``."""
+        row = self.index(frame)
+        return Pose(self.rotation[row], self.expression[row], self.transl[row])
+
+    def select(self, frames: Iterable[int]) -> Poses:
+        """The poses of some frame numbers, in their order; ValueError as of ``index``."""
+        chosen = tuple(frames)
+        rows = [self.index(frame) for frame in chosen]
+        return Poses(chosen, self.rotation[rows], self.expression[rows], self.transl[rows], self.valid[rows])
+
+    @staticmethod
+    def stack(frames: Iterable[int], poses: Sequence[Pose]) -> Poses:
+        """The poses of some frames as one record; at least one."""
+        return Poses(
+            frames=tuple(frames),
+            rotation=torch.stack([pose.rotation for pose in poses]),
+            expression=torch.stack([pose.expression for pose in poses]),
+            transl=torch.stack([pose.transl for pose in poses]),
+        )
 
 
 def write_poses(path: Path, poses: Poses) -> None:

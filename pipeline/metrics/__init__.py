@@ -1,22 +1,20 @@
 """How alike two images are: the only definition of each number that the project reports.
 
-Images are float tensors [H, W, 3] with values in [0, 1]; masks are [H, W]. The protocol (what is
-composited on what, which pixels count) is in :mod:`pipeline.metrics.protocol`.
+Images are float tensors [H, W, 3] with values in [0, 1]; masks are [H, W]. Which pixels
+count is in :mod:`pipeline.metrics.protocol`, compositing in :mod:`pipeline.composite`.
 """
 
-from pipeline.metrics.image import PSNR_CAP, dissimilarity, psnr, ssim
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.protocol import BACKGROUNDS, EROSION, composite, interior, over
+from pipeline.metrics.protocol import EROSION, interior
+from pipeline.metrics.psnr import PSNR_CAP, psnr
+from pipeline.metrics.ssim import ssim, ssim_loss
 
 __all__ = [
-    "BACKGROUNDS",
     "EROSION",
     "PSNR_CAP",
     "Lpips",
-    "composite",
-    "dissimilarity",
     "interior",
-    "over",
     "psnr",
     "ssim",
+    "ssim_loss",
 ]

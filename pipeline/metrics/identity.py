@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.boxes import Box
 from pipeline.errors import UserError
 
 ASSETS = ("dlib", "identity")
@@ -33,11 +34,11 @@ class Face:
     """One found face.
 
     Attributes:
-        box: left, top, right, bottom in pixels of the picture.
+        box: of the picture.
         embedding: [128] float64; its length is about 1.4.
     """
 
-    box: tuple[int, int, int, int]
+    box: Box
     embedding: np.ndarray
 
 
@@ -63,16 +64,16 @@ class FaceReader:
         self._align = dlib.shape_predictor(str(models / _POINTS))
         self._embed = dlib.face_recognition_model_v1(str(models / _RESNET))
 
-    def read(self, image: np.ndarray, box: tuple[int, int, int, int] | None = None) -> Face | None:
+    def read(self, image: np.ndarray, box: Box | None = None) -> Face | None:
         """The face in ``image`` [H, W, 3] uint8 RGB, or None where the finder sees none.
 
         Args:
             image: the picture.
-            box: left, top, right, bottom: where to look, so that small faces are enlarged enough.
+            box: where to look, so that small faces are enlarged enough; it may reach out of the picture.
         """
-        left, top, right, bottom = box or (0, 0, image.shape[1], image.shape[0])
-        left, top = max(0, left), max(0, top)
-        part = image[top : max(bottom, top), left : max(right, left)]
+        box = box or Box.whole(image)
+        left, top = max(0, box.left), max(0, box.top)
+        part = image[top : max(box.bottom, top), left : max(box.right, left)]
         if min(part.shape[:2]) < 8:
             return None
         scale = _scale(part.shape[1], part.shape[0])
@@ -84,8 +85,8 @@ class FaceReader:
         embedding = np.array(self._embed.compute_face_descriptor(part, self._align(part, face)))
         sides = (face.left(), face.top(), face.right(), face.bottom())
         corner = (left, top, left, top)
-        placed = tuple(round(side / scale) + start for side, start in zip(sides, corner, strict=True))
-        return Face(placed, embedding)  # type: ignore[arg-type]
+        placed = (round(side / scale) + start for side, start in zip(sides, corner, strict=True))
+        return Face(Box(*placed), embedding)
 
 
 def identity_distance(first: np.ndarray, second: np.ndarray) -> float:

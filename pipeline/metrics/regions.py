@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.boxes import Box
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels; right and bottom are outside."""
 
 REGIONS = ("face", "hands")
 
@@ -50,9 +48,6 @@ def _box(points: np.ndarray, room: float, width: int, height: int) -> Box | None
     low, high = believed.min(0), believed.max(0)
     half = room * float((high - low).max()) / 2
     middle = (low + high) / 2
-    left, top = (max(0, int(np.floor(value))) for value in middle - half)
-    right, bottom = (int(np.ceil(value)) for value in middle + half)
-    right, bottom = min(width, right), min(height, bottom)
-    if min(right - left, bottom - top) < SMALLEST:
-        return None
-    return left, top, right, bottom
+    low, high = np.floor(middle - half), np.ceil(middle + half)
+    box = Box(*(int(value) for value in (*low, *high))).clipped(width, height)
+    return box if min(box.width, box.height) >= SMALLEST else None

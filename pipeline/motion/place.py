@@ -8,7 +8,16 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.body import BodyModel, Identity, joint_index, joint_transforms, rest_joints, rest_vertices, skin
+from pipeline.body import (
+    BodyModel,
+    Identity,
+    Pose,
+    joint_index,
+    joint_transforms,
+    linear_blend_skinning,
+    rest_joints,
+    rest_vertices,
+)
 from pipeline.motion.legs import leg_of
 from pipeline.motion.record import Motion
 from pipeline.motion.retarget import yaw
@@ -35,6 +44,10 @@ class Placed:
 
     def __len__(self) -> int:
         return len(self.rotation)
+
+    def pose(self, row: int) -> Pose:
+        """The pose of one of the T frames, counted from 0."""
+        return Pose(self.rotation[row], self.expression[row], self.transl[row])
 
 
 def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = False) -> Placed:
@@ -79,5 +92,7 @@ def lowest_point(body: BodyModel, identity: Identity, rotation: Tensor, transl: 
     for start in range(0, len(rotation), _CHUNK):
         some = slice(start, start + _CHUNK)
         transforms = joint_transforms(rotation[some], joints, body.parents)
-        lowest.append(float((skin(transforms, weights, points)[..., 1] + transl[some, None, 1]).min()))
+        lowest.append(
+            float((linear_blend_skinning(transforms, weights, points)[..., 1] + transl[some, None, 1]).min())
+        )
     return min(lowest)

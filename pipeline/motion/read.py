@@ -18,6 +18,7 @@ from pipeline.motion.names import MotionName
 from pipeline.motion.peers import read_peers
 from pipeline.motion.record import Motion, Span
 from pipeline.motion.retarget import match_joints, retarget_rows
+from pipeline.spread import spread_end_to_end
 
 _REFERENCE_FRAMES = 500  # among which the one with the straightest limbs is sought
 
@@ -70,7 +71,7 @@ def read_capture(path: Path, wearer: Wearer, span: Span) -> Motion:
     columns = match_joints(bvh.names, str(path))
     rows, fps = span.rows(len(bvh.values), bvh.fps, path.name)
     count = len(bvh.values)
-    reference = np.unique(np.linspace(0, count - 1, min(count, _REFERENCE_FRAMES)).round().astype(np.int64))
+    reference = np.array(spread_end_to_end(range(count), _REFERENCE_FRAMES), np.int64)
     joints = rest_joints(wearer.body, wearer.identity)
     rotation, root = retarget_rows(bvh, joints, wearer.body.parents, rows, reference)
     used = set(columns.values())

@@ -22,8 +22,8 @@ import numpy as np
 from numba import prange, types
 from numba.extending import overload
 
+from pipeline.numba_kernels import kernel, parallel_kernel
 from pipeline.splat import constants
-from pipeline.splat.kernels import kernel, parallel_kernel
 from pipeline.splat.tiles import TILE
 
 _PIXELS = TILE * TILE

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import prange
 
-from pipeline.splat.kernels import kernel, parallel_kernel
+from pipeline.numba_kernels import kernel, parallel_kernel
 
 # The columns of a record, which is all that the blending reads of a Gaussian. Sixteen columns are one cache
 # line in single precision.

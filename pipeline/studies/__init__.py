@@ -1,6 +1,7 @@
-"""Studies: what each part of the method is worth (``ablation``), and what accuracy costs (``tradeoff``).
+"""Studies of one subject or dataset; only dodo.py imports them.
 
-Both run one subject under several settings (``pipeline.study``), share every version in the store that two
-settings have in common, go on where they were interrupted, and leave tables, plots and one page in
-``data/studies/<kind>/<name>/``.
+``ablation`` finds what each part of the method is worth, ``tradeoff`` what accuracy costs in time, and
+``compare`` sets our scores beside a dataset's published ones. The first two run one subject under several
+settings (``variants``), share every result in the store that two settings have in common, go on where they
+were interrupted, and leave tables, plots and one page in ``data/studies/<kind>/<name>/``.
 """

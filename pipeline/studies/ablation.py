@@ -9,348 +9,338 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import statistics
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.artifact import MANIFEST
-from pipeline.digest import write_atomically
-from pipeline.errors import UserError
-from pipeline.job import job_from_words, shown, workspace_from_words
-from pipeline.settings import read_toml
-from pipeline.stage import Progress
-from pipeline.studies.run import Ending, Failure, base_words, run_variants, scale_words, study_folder
-from pipeline.studies.sizes import sizes_of, versions_of
-from pipeline.studies.tables import HERE, MEAN, PAPER, Column, Row, Table, Value, values_of
-from pipeline.study import Outcome, Variant
-from pipeline.workspace import Workspace
+import pandas as pd
 
-FULL, CHANCE = "full", "chance"
-REFINED = "avatar_refined"  # evaluate's name for it
-WHOLE_BODY = "face,left_hand,right_hand,rest"
+from pipeline.artifact import MANIFEST
+from pipeline.config.request import Request
+from pipeline.errors import UserError
+from pipeline.run.progress import Progress
+from pipeline.settings import read_toml
+from pipeline.studies.measure import AvatarMeter
+from pipeline.studies.plots import bars
+from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section
+from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, REGIONS, RUNTIME, Table
+from pipeline.studies.variants import Base, Result, Variant, base_of, scale_overrides, study_folder
+
+FULL, CHANCE, CHANCE_LABEL = "full", "chance", "another seed"
 FIXED = 0.4  # the paper's threshold by hand
 
-VARIANTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    FULL: ("full", {}),
-    "no_refinement": ("without refinement (residual colours)", {"train.residual_from": "1"}),
-    "no_views": ("without generated views", {"auxiliary.generator": "off"}),
-    "no_gate": ("without visibility gate", {"plan.visibility_gate": "off"}),
-    "no_masked_fit": ("without masked fit", {"fit.masked": "false"}),
-    "weight_1": ("generated views' weight 1.0", {"train.generated": "1"}),
-    "moves": ("residual also moves positions", {"train.residual_moves": "true"}),
-    "whole_body": ("whole-body residual", {"train.residual_parts": WHOLE_BODY}),
-    "fixed_threshold": (f"fixed threshold {FIXED}", {"train.gate_threshold": str(FIXED)}),
+VARIANTS: Mapping[str, Variant] = {
+    FULL: Variant("full"),
+    "no_refinement": Variant("without refinement (residual colours)", {"train.residual_from": "1"}),
+    "no_views": Variant("without generated views", {"auxiliary.generator": "off"}),
+    "no_gate": Variant("without visibility gate", {"plan.visibility_gate": "off"}),
+    "no_masked_fit": Variant("without masked fit", {"fit.masked": "false"}),
+    "weight_1": Variant("generated views' weight 1.0", {"train.generated": "1"}),
+    "moves": Variant("residual also moves positions", {"train.residual_moves": "true"}),
+    "whole_body": Variant("whole-body residual", {"train.residual_parts": "face,left_hand,right_hand,rest"}),
+    "fixed_threshold": Variant(f"fixed threshold {FIXED}", {"train.gate_threshold": str(FIXED)}),
 }
-"""Variant -> its label and what it changes, in the paper's order; another seed comes last."""
+"""Key -> variant, in the paper's order; another seed comes last."""
 
-IMAGE = (
-    Column("psnr", "PSNR", 2, "higher"),
-    Column("ssim", "SSIM", 4, "higher"),
-    Column("lpips_alex", "LPIPS×100", 2, "lower", 100.0),
-)
-RUNTIME = (
-    Column("gaussians", "#G", 0),
-    Column("asset_mib", "asset MB", 2, "lower"),
-    Column("animation_ms", "animation ms", 1, "lower"),
-    Column("rendering_ms", "rendering ms", 1, "lower"),
-    Column("total_ms", "total ms", 1, "lower"),
-    Column("fps", "frames/s", 1, "higher"),
-)
-EVEN = tuple(dataclasses.replace(column, better="") for column in IMAGE)  # neither row is the better one
-REGIONS = tuple(
-    dataclasses.replace(column, key=f"{column.key}_{region}", label=f"{region} {column.label}")
-    for region in ("face", "hands")
-    for column in IMAGE
-)
-COLUMNS = {"runtime": RUNTIME, "regions": REGIONS, "chance": EVEN}
+LABELS = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: CHANCE_LABEL}
+
+COLUMNS: Mapping[str, Sequence[str]] = {"runtime": list(RUNTIME), "regions": list(REGIONS)}
+CAPTIONS = {
+    "runtime": "Processor milliseconds of one thread, the least of 15 frames of the baked avatar in held-out "
+    "poses, drawn at 512×512; asset: mean, opacity, scale, rotation and colour in float32.",
+    "regions": "Means over held-out frames of square crops around face and hands.",
+}
 SAME = "the very same avatar as full: here it changes nothing"
+CHANCE_TABLE = {
+    "name": "chance",
+    "title": "What chance is worth: the whole method with another seed",
+    "kind": "chance",
+    "rows": [{"variant": FULL}, {"variant": CHANCE}],
+}
 
 
 @dataclasses.dataclass(frozen=True)
-class Results:
-    """What an ablation came to.
+class Ablation:
+    """The results of an ablation.
 
     Attributes:
-        subjects: whose avatars.
-        endings: (subject, variant) -> outcome or failure.
-        speeds: (subject, variant) -> numbers of ``pipeline.studies.clip.speeds``.
+        results: (subject, key of the variant) -> result.
+        scores: a row a result, indexed likewise; a column a metric or a number of the runtime.
         dataset: the one that all subjects belong to; empty if none.
-        refined: whether the numbers that count are those with held-out poses refined, as on NeuMan.
+        refined: whether the scores are those with held-out poses refined, as on NeuMan.
     """
 
-    subjects: tuple[str, ...]
-    endings: Mapping[tuple[str, str], Ending]
-    speeds: Mapping[tuple[str, str], Mapping[str, float]]
+    results: Mapping[tuple[str, str], Result]
+    scores: pd.DataFrame
     dataset: str = ""
     refined: bool = False
 
-    def outcome(self, subject: str, variant: str) -> Outcome | None:
-        """The outcome, None where the variant failed or was not reached."""
-        ending = self.endings.get((subject, variant))
-        return ending if isinstance(ending, Outcome) else None
+    @property
+    def subjects(self) -> list[str]:
+        """Whose avatars."""
+        return list(dict.fromkeys(subject for subject, _ in self.results))
 
-    def value(self, subject: str, variant: str, key: str) -> float:
-        """A metric of the held-out frames, or a number of the runtime; NaN where there is none."""
-        outcome = self.outcome(subject, variant)
-        if outcome is None:
-            return math.nan
-        speed = self.speeds.get((subject, variant), {})
-        if key in ("total_ms", "fps"):
-            total = speed.get("animation_ms", math.nan) + speed.get("rendering_ms", math.nan)
-            return total if key == "total_ms" else 1e3 / total
-        if key in speed:
-            return speed[key]
-        return outcome.held_out(key, REFINED if self.refined else "avatar")
+    def gains(self, metric: str) -> pd.Series:
+        """Key of a variant -> its mean difference from the whole method, over the subjects that have both.
+
+        For another seed it is the mean of absolute differences: how large one must be to mean anything.
+        """
+        table = self.scores[metric].unstack()
+        differences = table.sub(table[FULL], axis=0)
+        differences[CHANCE] = differences[CHANCE].abs()
+        return differences.mean()
 
 
-def ablate(name: str, subjects: Sequence[str], words: Mapping[str, str]) -> Path:
+def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     """Runs every variant of the subjects and writes tables, plots and page.
 
     Args:
         name: of the study: a subject, or a dataset.
         subjects: whose avatars.
-        words: the command line's.
+        request: the command line's.
 
     Returns:
         The study's folder.
 
     Raises:
-        UserError: a word is wrong, or nothing at all could be made.
+        UserError: a setting is wrong, or nothing at all could be made.
     """
-    scale_words(words)  # before anything is made
-    workspace = workspace_from_words(words)
-    folder, start = study_folder(workspace, "ablate", name), time.monotonic()
-    endings = run_all(subjects, words, folder / "log.txt")
-    results = Results(
-        subjects=tuple(subjects),
-        endings=endings,
-        speeds=speeds_of(endings, words, workspace),
-        dataset=dataset_of(workspace, subjects, words),
-        refined=all(counts_refined(subject, words) for subject in subjects),
-    )
-    if not any(isinstance(one, Outcome) for one in endings.values()):
-        raise UserError(next(one.reason for one in endings.values() if isinstance(one, Failure)))
-    publish(folder, name, results, words, time.monotonic() - start)
+    scale_overrides(request)  # refused before anything is made
+    start, folder = time.monotonic(), study_folder(request, "ablate", name)
+    bases, results = run_all(subjects, request, folder / "log.txt")
+    if all(result.failure for result in results.values()):
+        raise UserError(next(iter(results.values())).failure)
+    refined = all(counts_refined(base) for base in bases.values())
+    ablation = Ablation(results, scores_of(bases, results, refined), dataset_of(subjects, request), refined)
+    write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
     return folder
 
 
-def run_all(subjects: Sequence[str], words: Mapping[str, str], log: Path) -> dict[tuple[str, str], Ending]:
-    """Every variant of every subject, a subject after the other."""
-    endings: dict[tuple[str, str], Ending] = {}
+def run_all(
+    subjects: Sequence[str], request: Request, log: Path
+) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
+    """Every variant of every subject, a subject after the other; and the bases that could be read."""
+    bases, results = {}, {}
     progress = Progress(len(subjects) * (len(VARIANTS) + 1), "ablate")
     try:
         for subject in subjects:
             try:
-                own = full_words(subject, words)
+                bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
             except UserError as error:
-                endings |= {(subject, key): Failure(subject, key, str(error)) for key in VARIANTS}
+                results |= {(subject, key): Result(subject, key, str(error)) for key in (*VARIANTS, CHANCE)}
                 progress.advance(len(VARIANTS) + 1, subject)
                 continue
-            for key, variant in variants_of(subject, own).items():
-                endings[subject, key] = run_variants(subject, [variant], own, log, progress)[0]
+            for key, variant in variants_of(bases[subject]).items():
+                results[subject, key] = bases[subject].run(variant)
+                print(results[subject, key].line, flush=True)
+                progress.advance(1, variant.name)
     finally:
         progress.close()
-    return endings
+    return bases, results
 
 
-def full_words(subject: str, words: Mapping[str, str]) -> dict[str, str]:
-    """The whole method: with generated views if the plan asks for them, unless words say otherwise."""
-    return {"auxiliary.generator": "auto", **base_words(subject, words)}
-
-
-def variants_of(subject: str, own: Mapping[str, str]) -> dict[str, Variant]:
+def variants_of(base: Base) -> dict[str, Variant]:
     """The variants in the paper's order, and another seed."""
-    seed = job_from_words(subject, own).settings["train"].seed + 1
-    found = {key: Variant(label, words) for key, (label, words) in VARIANTS.items()}
-    return {**found, CHANCE: Variant("another seed", {"train.seed": str(seed)})}
+    seed = base.settings["train"].seed + 1
+    return {**VARIANTS, CHANCE: Variant(CHANCE_LABEL, {"train.seed": str(seed)})}
 
 
-def dataset_of(workspace: Workspace, subjects: Sequence[str], words: Mapping[str, str]) -> str:
-    """The dataset that all subjects belong to, or nothing."""
-    if "dataset" in words:
-        return words["dataset"]
-    files = [workspace.data / "subjects" / f"{subject}.toml" for subject in subjects]
+def dataset_of(subjects: Sequence[str], request: Request) -> str:
+    """The dataset that all subjects belong to; empty if none."""
+    files = [request.workspace.data / "subjects" / f"{subject}.toml" for subject in subjects]
     names = {str(read_toml(file).get("dataset", "")) if file.is_file() else "" for file in files}
-    return names.pop() if len(names) == 1 else ""
+    return request.dataset or (names.pop() if len(names) == 1 else "")
 
 
-def counts_refined(subject: str, words: Mapping[str, str]) -> bool:
-    """Whether the settings ask for numbers with held-out poses refined, as the paper has them on NeuMan."""
-    evaluate = job_from_words(subject, full_words(subject, words)).settings["evaluate"]
+def counts_refined(base: Base) -> bool:
+    """Whether the settings ask for scores with held-out poses refined, as the paper has them on NeuMan."""
+    evaluate = base.settings["evaluate"]
     return evaluate.refine_test_poses == "on" or getattr(evaluate, "protocol", "") == "paper"
 
 
-def speeds_of(
-    endings: Mapping[tuple[str, str], Ending], words: Mapping[str, str], workspace: Workspace
-) -> dict[tuple[str, str], dict[str, float]]:
-    """What a frame of each avatar costs; measured once."""
-    from pipeline.studies.clip import speeds  # torch, which the DAG does without
-    from pipeline.studies.measured import clip_of, notes_of
-
-    found: dict[tuple[str, str], dict[str, float]] = {}
-    for subject in dict.fromkeys(subject for subject, _ in endings):
-        made = {key: one for key, one in endings.items() if key[0] == subject and isinstance(one, Outcome)}
-        if not made:
-            continue
-        print(f"{subject}: timing {len(made)} avatars in motion", flush=True)
-        clip = clip_of(next(iter(made.values())), words, workspace)
-        by_key = speeds(list(made.values()), clip, notes_of(workspace, subject))
-        found |= {key: by_key[one.folders["train"].name] for key, one in made.items()}
-    return found
+def scores_of(
+    bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result], refined: bool
+) -> pd.DataFrame:
+    """Every result's scores of held-out frames and what a frame of its avatar costs; see ``Ablation``."""
+    speeds: dict[str, Mapping[str, float]] = {}
+    for subject, base in bases.items():
+        done = [one for one in results.values() if one.subject == subject and not one.failure]
+        if done:
+            print(f"{subject}: timing {len(done)} avatars in motion", flush=True)
+            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
+    return score_table(results, speeds, refined)
 
 
-def tables_of(results: Results, sizes: str) -> list[Table]:
-    """The paper's tables with what was measured here.
+def score_table(
+    results: Mapping[tuple[str, str], Result], speeds: Mapping[str, Mapping[str, float]], refined: bool
+) -> pd.DataFrame:
+    """Scores and runtime of results, indexed by subject and variant; NaN where there is none.
 
     Args:
-        results: of every variant.
+        results: as ``Ablation`` has them.
+        speeds: name of the train version -> numbers of ``AvatarMeter.speeds``.
+        refined: whether scores are those with held-out poses refined.
+    """
+    rows = [
+        {}
+        if one.failure
+        else one.held_out("avatar_refined" if refined else "avatar") | dict(speeds[one.folders["train"].name])
+        for one in results.values()
+    ]
+    index = pd.MultiIndex.from_tuples(list(results), names=["subject", "variant"])
+    scores = pd.DataFrame(rows, index).reindex(columns=[*IMAGE, *RUNTIME, *REGIONS]).astype(float)
+    scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
+    scores["fps"] = 1e3 / scores["total_ms"]
+    return scores
+
+
+def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
+    """The paper's tables with what was measured here; those of which nothing was measured are left out.
+
+    Args:
+        ablation: its results.
         sizes: a sentence on the sizes, for the captions.
     """
-    described = read_toml(Path(__file__).with_name("paper.toml"))["tables"]
-    psnr = [[results.value(one, which, "psnr") for which in (CHANCE, FULL)] for one in results.subjects]
-    gap = _mean([abs(other - full) for other, full in psnr])
-    sizes += f" Another seed differs by {gap:.2f} dB." if math.isfinite(gap) else ""
-    tables = [_table(one, results, sizes) for one in described]
-    chance = {
-        "name": "chance",
-        "title": "What chance is worth: the whole method with another seed",
-        "kind": "chance",
-        "rows": [{"variant": FULL}, {"variant": CHANCE}],
-    }
-    return [table for table in (*tables, _table(chance, results, sizes)) if not _empty(table)]
+    noise = ablation.gains("psnr")[CHANCE]
+    sizes += f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
+    described = [*read_toml(Path(__file__).with_name("paper.toml"))["tables"], CHANCE_TABLE]
+    return [
+        table_of(about, ablation, sizes)
+        for about in described
+        if ablation.scores[COLUMNS.get(about.get("kind"), list(IMAGE))].notna().any(axis=None)
+    ]
 
 
-def _empty(table: Table) -> bool:
-    """Whether nothing of a table was measured: what evaluate was not asked for."""
-    own = [value for row in table.rows for (_, source), value in row.values.items() if source == HERE]
-    return not any(math.isfinite(value) for value in own)
+def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
+    """One of the paper's tables; its own figures stand beside ours where they are of the same footage.
 
-
-def _table(about: Mapping[str, Any], results: Results, sizes: str) -> Table:
-    columns = COLUMNS.get(about.get("kind", ""), IMAGE)
-    same = results.dataset and results.dataset == about.get("dataset")
-    if same and "subject" in about:
-        same = results.subjects == (about["subject"],)
-    published = (
-        [dataclasses.replace(column, source=PAPER) for column in columns]
-        if same and any("paper" in row for row in about["rows"])
-        else []
-    )
-    rows = [_row(row, about, results, columns, bool(published)) for row in about["rows"]]
-    for row in about.get("published", ()):
-        if row["dataset"] == results.dataset:
-            numbers = zip(columns, row["values"], strict=True)
-            values = {
-                (column.key, HERE): (value / column.factor if column.factor != 1 else value)
-                for column, value in numbers
-            }
-            rows.append(Row(row["label"], values, "published, on another machine"))
-    poses = ", poses refined on them" if results.refined else ""
-    how = HOW.get(about.get("kind", ""), f"Means over held-out frames{poses}.")
-    return Table(about["name"], about["title"], f"{how} {sizes}", [*columns, *published], rows)
-
-
-HOW = {
-    "runtime": "Processor milliseconds of one thread, the least of 15 frames of the baked avatar in held-out "
-    "poses, drawn at 512×512; asset: mean, opacity, scale, rotation and colour in float32.",
-    "regions": "Means over held-out frames of square crops around face and hands.",
-}
-
-
-def _row(
-    row: Mapping[str, Any],
-    about: Mapping[str, Any],
-    results: Results,
-    columns: Sequence[Column],
-    published: bool,
-) -> Row:
-    variant = row["variant"]
-    label = "another seed" if variant == CHANCE else VARIANTS[variant][0]
-    counted = complete(about, results)
-    values = {
-        (column.key, HERE): _mean([results.value(subject, variant, column.key) for subject in counted])
-        for column in columns
-    }
-    if published and "paper" in row:
-        for column, value in zip(columns, row["paper"], strict=True):
-            values[column.key, PAPER] = value / column.factor
-    return Row(label, values, note_on(variant, results, counted), main=variant == FULL)
-
-
-def complete(about: Mapping[str, Any], results: Results) -> tuple[str, ...]:
-    """The subjects that have every row of a table, so that its means are over the same; else all."""
+    Args:
+        about: the table as paper.toml describes it.
+        ablation: its results.
+        sizes: a sentence for the caption.
+    """
+    keys = COLUMNS.get(about.get("kind"), list(IMAGE))
     wanted = [row["variant"] for row in about["rows"]]
-    whole = tuple(
-        subject for subject in results.subjects if all(results.outcome(subject, one) for one in wanted)
-    )
-    return whole or results.subjects
+    present = ablation.scores["psnr"].unstack()[wanted].notna().all(axis=1)
+    counted = [subject for subject in ablation.subjects if present[subject]] or ablation.subjects
+    same = ablation.dataset and ablation.dataset == about.get("dataset")
+    same = same and ("subject" not in about or [about["subject"]] == ablation.subjects)
+
+    def published(values: Sequence[float]) -> list[float]:
+        return [value / METRICS[key].factor for key, value in zip(keys, values, strict=True)]
+
+    rows = {}
+    for row in about["rows"]:
+        own = ablation.scores.xs(row["variant"], level="variant").loc[counted, keys].mean().to_dict()
+        paper = (
+            dict(zip((f"{PAPER} {key}" for key in keys), published(row["paper"]), strict=True))
+            if same
+            else {}
+        )
+        note = {NOTE: note_on(row["variant"], ablation, counted), MAIN: row["variant"] == FULL}
+        rows[LABELS[row["variant"]]] = own | paper | note
+    for row in about.get("published", ()):
+        if row["dataset"] == ablation.dataset:
+            values = dict(zip(keys, published(row["values"]), strict=True))
+            rows[row["label"]] = {**values, NOTE: "published, on another machine"}
+    poses = ", poses refined on them" if ablation.refined else ""
+    caption = CAPTIONS.get(about.get("kind"), f"Means over held-out frames{poses}.")
+    frame, ranked = pd.DataFrame.from_dict(rows, orient="index"), about.get("kind") != "chance"
+    return Table(about["name"], about["title"], f"{caption} {sizes}", frame, ranked=ranked)
 
 
-def note_on(variant: str, results: Results, counted: Sequence[str]) -> str:
-    """What must be said of a row: who failed, whose avatar is full's own, how many it is a mean of."""
-    notes = []
-    for subject in results.subjects:
-        ending = results.endings.get((subject, variant))
-        if isinstance(ending, Failure):
-            notes.append(f"failed{_of(subject, results)}: {ending.reason}")
-        elif variant not in (FULL, CHANCE) and _same_avatar(results, subject, variant):
-            notes.append(f"{SAME}{_of(subject, results)}")
-    if len(counted) < len(results.subjects):
-        notes.append(f"mean of {len(counted)} of {len(results.subjects)} subjects")
+def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
+    """The remarks on a row: who failed, whose avatar is full's own, how many subjects it is a mean of."""
+    notes, several = [], len(ablation.subjects) > 1
+    for subject in ablation.subjects:
+        of, one, full = (
+            f" ({subject})" if several else "",
+            *(ablation.results[subject, k] for k in (key, FULL)),
+        )
+        if one.failure:
+            notes.append(f"failed{of}: {one.failure}")
+        elif key not in (FULL, CHANCE) and not full.failure and avatar_digest(one) == avatar_digest(full):
+            notes.append(f"{SAME}{of}")
+    if len(counted) < len(ablation.subjects):
+        notes.append(f"mean of {len(counted)} of {len(ablation.subjects)} subjects")
     return "; ".join(notes)
 
 
-def _of(subject: str, results: Results) -> str:
-    return f" ({subject})" if len(results.subjects) > 1 else ""
-
-
-def _same_avatar(results: Results, subject: str, variant: str) -> bool:
-    one, full = results.outcome(subject, variant), results.outcome(subject, FULL)
-    return one is not None and full is not None and avatar_digest(one) == avatar_digest(full)
-
-
-def avatar_digest(outcome: Outcome) -> str:
+def avatar_digest(result: Result) -> str:
     """The digest of the avatar's file, as the store's manifest has it."""
-    manifest = json.loads((outcome.folders["train"] / MANIFEST).read_text(encoding="utf-8"))
+    manifest = json.loads((result.folders["train"] / MANIFEST).read_text(encoding="utf-8"))
     return next(file["sha256"] for file in manifest["files"] if file["path"] == "avatar.safetensors")
 
 
-def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if math.isfinite(value)]
-    return statistics.fmean(known) if known else math.nan
-
-
-def parquet_values(tables: Sequence[Table], results: Results) -> list[Value]:
+def values_of(tables: Sequence[Table], ablation: Ablation) -> pd.DataFrame:
     """Every number of the tables, and each subject's own where there are several."""
-    several = len(results.subjects) > 1
-    values = [one for table in tables for one in values_of(table, MEAN if several else results.subjects[0])]
+    several = len(ablation.subjects) > 1
+    values = [table.values(MEAN if several else ablation.subjects[0]) for table in tables]
     if several:
-        keys = {column.key for column in (*IMAGE, *RUNTIME, *REGIONS)}
-        labels = {**{key: label for key, (label, _) in VARIANTS.items()}, CHANCE: "another seed"}
-        values += [
-            Value("each subject", labels[variant], subject, key, HERE, value)
-            for subject, variant in results.endings
-            for key in sorted(keys)
-            if math.isfinite(value := results.value(subject, variant, key))
-        ]
-    return values
+        own = ablation.scores.rename_axis(columns="metric").stack().rename("value").reset_index()
+        own = own.assign(table="each subject", row=own["variant"].map(LABELS), source=HERE).dropna()
+        values.append(own[values[0].columns])
+    return pd.concat(values, ignore_index=True)
 
 
-def publish(folder: Path, name: str, results: Results, words: Mapping[str, str], seconds: float) -> None:
-    """Writes the tables, the plot and the page, and says where they are."""
-    from pipeline.studies.ablation_report import write_ablation
-    from pipeline.studies.page import total_time
-    from pipeline.studies.tables import latex, markdown, write_values
+def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seconds: float) -> None:
+    """Writes the tables, the plots and the page.
 
-    first = next(one for one in results.endings.values() if isinstance(one, Outcome))
-    sizes = sizes_of(full_words(first.subject, words), first)
-    tables = tables_of(results, sizes)
-    write_atomically(folder / "table.md", "\n".join(markdown(table) for table in tables))
-    write_atomically(folder / "table.tex", "\n".join(latex(table) for table in tables))
-    write_values(folder / "table.parquet", parquet_values(tables, results))
-    write_ablation(folder, name, results, tables, versions_of(first), seconds, words)
-    print("\n".join(markdown(table) for table in tables))
-    made = [one for one in results.endings.values() if isinstance(one, Outcome)]
-    print(f"{total_time(made)} This call: {seconds:.0f} s; tables, plots and page: {shown(folder)}")
+    Args:
+        folder: where they go.
+        name: of the study.
+        ablation: its results.
+        base: a subject's, for the settings.
+        seconds: of this call.
+    """
+    pictures = []
+    for metric, label, file, factor in (
+        ("psnr", "PSNR against full, dB", "worth_psnr.png", 1),
+        ("lpips_alex", "LPIPS×100 against full, less is better", "worth_lpips.png", 100),
+    ):
+        gains = factor * ablation.gains(metric)
+        own = pd.Series({one.name: gains[key] for key, one in VARIANTS.items() if key != FULL})
+        bars(folder / file, own, label, gains[CHANCE], higher_is_better=metric == "psnr")
+        pictures.append((folder / file, f"{label}; grey: by how much another seed differs."))
+    several = len(ablation.subjects) > 1
+    done = [one for one in ablation.results.values() if not one.failure]
+    tables = tables_of(ablation, sizes_of(base.settings))
+    changed = {one.name: one.overrides for one in variants_of(base).values()}
+    results = {f"{one.subject}, {one.variant}" if several else one.variant: one for one in done}
+    page = Page(
+        title=f"{name}: what each part is worth",
+        lead=headline(ablation),
+        lines=[f"Subjects: {', '.join(ablation.subjects)}."] if several else [],
+        sections=[
+            Section("At a glance", pictures=pictures),
+            Section("The paper's tables", tables=tables),
+            settings_section(base.settings, changed),
+            timings_section(results, seconds),
+        ],
+    )
+    publish(folder, page, tables, values_of(tables, ablation))
+
+
+def headline(ablation: Ablation) -> str:
+    """One sentence: what costs most when it is left out, what gains, and what does no more than chance."""
+    gains = ablation.gains("psnr")
+    chance = gains[CHANCE]
+    noise = chance if math.isfinite(chance) else 0.0
+    gains = gains[[key for key in VARIANTS if key != FULL]].dropna()
+    if gains.empty:
+        return "No variant could be compared with the whole method."
+    parts = []
+    for key, word, counts in (
+        (gains.idxmin(), "costs", gains.min() < -noise),
+        (gains.idxmax(), "gains", gains.max() > noise),
+    ):
+        if counts:
+            parts.append(f"{VARIANTS[key].name} {word} most: {gains[key]:+.2f} dB")
+    within = (gains.abs() <= chance).sum()
+    if within:
+        parts.append(
+            f"{within} of {len(gains)} variants differ by no more than another seed does ({noise:.2f} dB)"
+        )
+    text = "; ".join(parts) or "no variant differs from the whole method"
+    return f"{text[0].upper()}{text[1:]}."

@@ -1,82 +1,79 @@
-"""A study's tables: one description, as Markdown, LaTeX, HTML cells and Parquet."""
+"""A study's tables: numbers in a data frame, shown as Markdown, LaTeX and HTML cells, kept as Parquet."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 
-import numpy as np
-import pyarrow as pa
-
-from pipeline.tables import write_table
-
-SCHEMA = pa.schema(
-    [
-        ("table", pa.string()),
-        ("row", pa.string()),
-        ("subject", pa.string()),
-        ("metric", pa.string()),
-        ("source", pa.string()),
-        ("value", pa.float64()),
-    ]
-)
-"""A value a row; ``subject`` is ``mean`` for a mean over subjects; ``source`` is ``here`` or ``paper``."""
+import pandas as pd
 
 HERE, PAPER = "here", "paper"
-MEAN = "mean"
+MEAN = "mean"  # in place of a subject, for a mean over subjects
 NOTHING = "–"
+NOTE, MAIN = "note", "main"  # columns of a table's rows that are no numbers
 
 
 @dataclasses.dataclass(frozen=True)
-class Column:
-    """A number of each row.
+class Metric:
+    """A number as tables show it.
 
     Attributes:
-        key: its name in a row and in Parquet.
-        label: of the head, plain text.
+        label: of its column's head, plain text.
         digits: after the point.
         better: ``higher``, ``lower``, or empty where neither is.
         factor: what it is shown times.
-        source: ``here`` or ``paper``.
     """
 
-    key: str
     label: str
     digits: int = 2
     better: str = ""
     factor: float = 1.0
-    source: str = HERE
 
-    @property
-    def head(self) -> str:
-        """The label with its arrow, and with the source where that is the paper."""
-        arrow = {"higher": " ↑", "lower": " ↓"}.get(self.better, "")
-        return f"{'paper: ' if self.source == PAPER else ''}{self.label}{arrow}"
+    def text(self, value: float) -> str:
+        """A number as it is shown."""
+        return f"{self.factor * value:,.{self.digits}f}" if math.isfinite(value) else NOTHING
 
-    def cell(self, value: float | None) -> str:
-        """A number as text."""
-        if value is None or not math.isfinite(value):
-            return NOTHING
-        return f"{self.factor * value:,.{self.digits}f}"
+    def best(self, values: pd.Series) -> str | None:
+        """The best number's text, for what looks equal is equally good; None if neither end is better."""
+        if not self.better or values.count() < 2:
+            return None
+        return self.text(values.max() if self.better == "higher" else values.min())
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """A line.
-
-    Attributes:
-        label: what it is of.
-        values: by the column's key and source.
-        note: what must be said of it; empty where nothing must.
-        main: whether it stands out.
-    """
-
-    label: str
-    values: Mapping[tuple[str, str], float]
-    note: str = ""
-    main: bool = False
+IMAGE = {
+    "psnr": Metric("PSNR", 2, "higher"),
+    "ssim": Metric("SSIM", 4, "higher"),
+    "lpips_alex": Metric("LPIPS×100", 2, "lower", 100.0),
+}
+REGIONS = {
+    f"{key}_{region}": dataclasses.replace(metric, label=f"{region} {metric.label}")
+    for region in ("face", "hands")
+    for key, metric in IMAGE.items()
+}
+RUNTIME = {
+    "gaussians": Metric("Gaussians", 0),
+    "asset_mib": Metric("asset MB", 2, "lower"),
+    "animation_ms": Metric("animation ms", 1, "lower"),
+    "rendering_ms": Metric("rendering ms", 1, "lower"),
+    "total_ms": Metric("total ms", 1, "lower"),
+    "fps": Metric("frames/s", 1, "higher"),
+}
+METRICS: Mapping[str, Metric] = {
+    **IMAGE,
+    **REGIONS,
+    **RUNTIME,
+    "psnr_interior": Metric("PSNR inside", 2, "higher"),
+    "train_s": Metric("training s", 0, "lower"),
+    "times": Metric("× base", 2),
+    "gain": Metric("gain dB", 2),
+    "whole_s": Metric("whole job s", 0, "lower"),
+    "short": Metric("short of frontier dB", 2),
+    "seconds": Metric("seconds", 2),
+    "pixels": Metric("px", 3, "lower"),
+    "millimetres": Metric("mm to the truth", 2, "lower"),
+}
+"""Key of a number, as Parquet has it -> the way that tables show it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,135 +81,130 @@ class Table:
     """A table.
 
     Attributes:
-        name: for Parquet and for LaTeX's label.
+        name: in Parquet and in LaTeX's label.
         title: above it.
         caption: below it: sizes, and how it was measured.
-        columns: in their order.
-        rows: in their order.
+        rows: indexed by label; a column for each number, in their order, by its key in ``METRICS``, with
+            ``paper`` and a space before it if the paper published it; and optionally ``note`` (text beside a
+            row) and ``main`` (whether it stands out).
         first: the head of the rows' labels.
-        notes: whether there is a last column with the rows' notes.
+        ranked: whether the best of each column is marked.
     """
 
     name: str
     title: str
     caption: str
-    columns: Sequence[Column]
-    rows: Sequence[Row]
+    rows: pd.DataFrame
     first: str = "variant"
-    notes: bool = True
+    ranked: bool = True
 
     @property
-    def noted(self) -> bool:
-        """Whether any row has a note to show."""
-        return self.notes and any(row.note for row in self.rows)
+    def numbers(self) -> pd.DataFrame:
+        """The rows' numbers, NaN where there is none."""
+        return self.rows.drop(columns=[NOTE, MAIN], errors="ignore").astype(float)
 
-    def best(self, column: Column) -> str | None:
-        """The cell's text of the best row; None where neither end is better, or only one row has a number.
+    @property
+    def texts(self) -> pd.DataFrame:
+        """The numbers as they are shown, under their heads."""
+        return pd.DataFrame({
+            self.head(name): values.map(METRICS[name.split()[-1]].text)
+            for name, values in self.numbers.items()
+        })  # fmt: skip
 
-        By its text, so that what looks equal is equally good.
-        """
-        known = [row.values.get((column.key, column.source), math.nan) for row in self.rows]
-        known = [value for value in known if math.isfinite(value)]
-        if not column.better or len(known) < 2:
-            return None
-        return column.cell(max(known) if column.better == "higher" else min(known))
+    def head(self, name: str) -> str:
+        """A column's label with its arrow, and with the source where that is the paper."""
+        source, _, key = name.rpartition(" ")
+        arrow = {"higher": " ↑", "lower": " ↓"}.get(METRICS[key].better, "") if self.ranked else ""
+        return f"{f'{source}: ' if source else ''}{METRICS[key].label}{arrow}"
 
-    def cells(self, row: Row) -> list[tuple[str, bool]]:
-        """The texts of a row's numbers, each with whether it is its column's best."""
-        texts = [column.cell(row.values.get((column.key, column.source))) for column in self.columns]
-        return [(text, text == self.best(column)) for text, column in zip(texts, self.columns, strict=True)]
+    @property
+    def best(self) -> pd.DataFrame:
+        """Whether each number is its column's best; of the shape of ``texts``."""
+        texts = self.texts
+        best = [METRICS[n.split()[-1]].best(v) if self.ranked else None for n, v in self.numbers.items()]
+        return pd.DataFrame({head: texts[head] == one for head, one in zip(texts, best, strict=True)})
+
+    @property
+    def notes(self) -> list[str]:
+        """A note a row, empty where there is none."""
+        return self.rows[NOTE].fillna("").tolist() if NOTE in self.rows else [""] * len(self.rows)
+
+    @property
+    def main(self) -> list[bool]:
+        """Whether each row stands out."""
+        return self.rows[MAIN].eq(True).tolist() if MAIN in self.rows else [False] * len(self.rows)
+
+    def values(self, subject: str) -> pd.DataFrame:
+        """A row a finite number: ``table``, ``row``, ``subject``, ``metric``, ``source``, ``value``."""
+        long = self.numbers.rename_axis(index="row", columns="name").stack().rename("value").reset_index()
+        long = long[long["value"].notna()]
+        paper = long["name"].str.startswith(PAPER)
+        return pd.DataFrame({
+            "table": self.name, "row": long["row"], "subject": paper.map({True: MEAN, False: subject}),
+            "metric": long["name"].str.split().str[-1], "source": paper.map({True: PAPER, False: HERE}),
+            "value": long["value"],
+        })  # fmt: skip
 
 
 def markdown(table: Table) -> str:
-    """The table as GitHub's Markdown, caption first."""
-    heads = [table.first, *(column.head for column in table.columns), *(["note"] if table.noted else [])]
-    lines = [f"### {table.title}", "", table.caption, ""] if table.caption else [f"### {table.title}", ""]
-    lines.append(f"| {' | '.join(_pipe(head) for head in heads)} |")
-    lines.append("|---|" + "---:|" * len(table.columns) + ("---|" if table.noted else ""))
-    for row in table.rows:
-        cells = [f"**{text}**" if best else text for text, best in table.cells(row)]
-        label = f"**{_pipe(row.label)}**" if row.main else _pipe(row.label)
-        lines.append(f"| {' | '.join([label, *cells, *([_pipe(row.note)] if table.noted else [])])} |")
-    return "\n".join(lines) + "\n"
+    """The table as GitHub's Markdown, title and caption first."""
+    shown = table.texts.where(~table.best, "**" + table.texts + "**")
+    shown.insert(
+        0, table.first, [f"**{x}**" if m else x for x, m in zip(shown.index, table.main, strict=True)]
+    )
+    if any(table.notes):
+        shown[NOTE] = table.notes
+    above = "\n\n".join(filter(None, (f"### {table.title}", table.caption)))
+    return f"{above}\n\n{pipe_table(shown)}\n"
 
 
-def _pipe(text: str) -> str:
+def pipe_table(texts: pd.DataFrame, numbers: str = "right") -> str:
+    """Texts as a Markdown table without its index; the first column and notes lie left.
+
+    Args:
+        texts: of the cells.
+        numbers: where the other columns lie.
+    """
+    texts = texts.map(_in_a_cell).rename(columns=_in_a_cell)
+    align = ["left" if place == 0 or name == NOTE else numbers for place, name in enumerate(texts)]
+    return texts.to_markdown(index=False, disable_numparse=True, colalign=align)
+
+
+def _in_a_cell(text: str) -> str:
     return text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
 
 
-ESCAPES = {
+LATEX = str.maketrans({
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "×": r"$\times$",
     "–": "--", "²": "$^2$", "\n": " ",
-}  # fmt: skip
-"""What LaTeX would take for something else, and what its standard fonts lack."""
-
-
-def escaped(text: str) -> str:
-    """Plain text for LaTeX."""
-    return "".join(ESCAPES.get(letter, letter) for letter in text)
+})  # fmt: skip
+"""The letters that LaTeX would take for something else, and those that its standard fonts lack."""
 
 
 def latex(table: Table) -> str:
-    """The table for LaTeX with booktabs; the caption has its notes."""
-    heads = [table.first.capitalize(), *(column.head for column in table.columns)]
-    lines = [
-        r"\begin{table}[t]",
-        r"\centering",
-        rf"\caption{{{escaped(' '.join(filter(None, (table.title + '.', table.caption))))}}}",
-        rf"\label{{tab:{table.name}}}",
-        rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
-        r"\toprule",
-        " & ".join(escaped(head) for head in heads) + r" \\",
-        r"\midrule",
-    ]
-    for row in table.rows:
-        cells = [rf"\textbf{{{escaped(text)}}}" if best else escaped(text) for text, best in table.cells(row)]
-        label = rf"\textbf{{{escaped(row.label)}}}" if row.main else escaped(row.label)
-        lines.append(" & ".join([label, *cells]) + r" \\")
+    """The table for LaTeX with booktabs; notes stand below it."""
+    bold = "textbf:--rwrap;"
+    shown = table.texts.map(lambda text: text.translate(LATEX))
+    shown = shown.rename(
+        columns=lambda head: head.translate(LATEX), index=lambda label: label.translate(LATEX)
+    )
+    best = pd.DataFrame(table.best.to_numpy(), shown.index, shown.columns)
+    styled = shown.style.apply(lambda _: best.map({True: bold, False: ""}.get), axis=None)
+    styled = styled.apply_index(lambda _: [bold if main else "" for main in table.main])
+    text = styled.to_latex(
+        hrules=True,
+        position="t",
+        position_float="centering",
+        column_format="l" + "r" * len(shown.columns),
+        caption=f"{table.title}. {table.caption}".translate(LATEX),
+        label=f"tab:{table.name}",
+    )
     notes = [
-        rf"\par\smallskip {{\footnotesize {escaped(row.label)}: {escaped(row.note)}.}}"
-        for row in table.rows
-        if table.notes and row.note
+        rf"\par\smallskip {{\footnotesize {f'{label}: {note}'.translate(LATEX)}.}}"
+        for label, note in zip(table.rows.index, table.notes, strict=True)
+        if note
     ]
-    lines += [r"\bottomrule", r"\end{tabular}", *notes, r"\end{table}"]
-    return "\n".join(lines) + "\n"
-
-
-@dataclasses.dataclass(frozen=True)
-class Value:
-    """A line of the Parquet file; see ``SCHEMA``."""
-
-    table: str
-    row: str
-    subject: str
-    metric: str
-    source: str
-    value: float
-
-
-def values_of(table: Table, subject: str) -> list[Value]:
-    """Every number of a table."""
-    return [
-        Value(
-            table.name,
-            row.label,
-            subject if column.source == HERE else MEAN,
-            column.key,
-            column.source,
-            value,
-        )
-        for row in table.rows
-        for column in table.columns
-        if math.isfinite(value := row.values.get((column.key, column.source), math.nan))
-    ]
-
-
-def write_values(path: Path, values: Sequence[Value]) -> None:
-    """Writes the Parquet file."""
-    columns = {
-        name: np.array([getattr(one, name) for one in values], float if name == "value" else object)
-        for name in SCHEMA.names
-    }
-    write_table(path, SCHEMA, columns)
+    end = r"\end{table}"
+    return text.replace(end, "\n".join([*notes, end]))

@@ -4,315 +4,392 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from pipeline.job import DEFAULT_PRESET, job_from_words, workspace_from_words
-from pipeline.studies.design import Point, label_of, singles, words_of
-from pipeline.studies.explore import (
-    DEFAULT_BUDGET,
-    Explorer,
-    Preset,
-    cost_of,
-    explore,
-    seconds_of,
+import numpy as np
+import pandas as pd
+
+from pipeline.config.request import Request
+from pipeline.curves import read_curve
+from pipeline.errors import UserError
+from pipeline.job import Job
+from pipeline.studies.fit_error import fit_numbers, fit_steps
+from pipeline.studies.measure import AvatarMeter, Numbers
+from pipeline.studies.plots import curves, scatter
+from pipeline.studies.report import (
+    Page,
+    Picture,
+    Section,
+    publish,
+    settings_section,
+    sizes_of,
+    timings_section,
 )
-from pipeline.studies.fits import FitPoint
-from pipeline.studies.frontier import frontier, short_of
-from pipeline.studies.knobs import CHANCE, Knob, knobs_of
-from pipeline.studies.run import Failure, base_words, stage_words, study_folder
-from pipeline.study import Outcome
+from pipeline.studies.search import TRAIN, Search, seconds_of, spoken, training_cost
+from pipeline.studies.sweep import (
+    CHANCE,
+    GAUSSIANS,
+    PRECISION,
+    Design,
+    Level,
+    combinations,
+    frontier,
+    gain_for_time,
+    overrides_of,
+    shortfalls,
+    sweep_levels,
+)
+from pipeline.studies.tables import MAIN, NOTE, Table
+from pipeline.studies.variants import Base, Result, Variant, base_of, run_record, study_folder
 
-if TYPE_CHECKING:
-    from pipeline.studies.clip import Clip
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """A row of the study: a point, or a preset.
-
-    Attributes:
-        number: of its row.
-        label: what it differs in from the base.
-        words: those that it adds.
-        outcome: what it came to; None where it failed.
-        reason: why it failed.
-        quality: metric -> mean over the base's held-out frames, at the base's picture size.
-        speed: numbers of ``pipeline.studies.clip.speeds``.
-        cost: processor seconds of training.
-        point: of the design; None for a preset.
-        preset: which it is; empty if none.
-    """
-
-    number: int
-    label: str
-    words: Mapping[str, str]
-    outcome: Outcome | None
-    reason: str
-    quality: Mapping[str, float]
-    speed: Mapping[str, float]
-    cost: float
-    point: Point | None = None
-    preset: str = ""
-
-    def get(self, metric: str) -> float:
-        """A metric; NaN where there is none."""
-        return self.quality.get(metric, math.nan)
-
-    @property
-    def gaussians(self) -> float:
-        """Of the avatar; NaN where there is none."""
-        return self.speed.get("gaussians", math.nan)
-
-    @property
-    def whole(self) -> float:
-        """Processor seconds of every stage up to training, of those that noted them."""
-        seconds = self.outcome.cpu_seconds.values() if self.outcome else ()
-        known = [value for value in seconds if math.isfinite(value)]
-        return sum(known) if known else math.nan
+DEFAULT_BUDGET = "20m"
+COLUMNS = (
+    "gaussians", "psnr", "psnr_interior", "ssim", "lpips_alex", "train_s", "times", "gain", "whole_s",
+    "animation_ms", "rendering_ms", "short",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
-class Study:
-    """Everything that a study of what accuracy costs came to.
+class Tradeoff:
+    """The results of a study.
 
     Attributes:
-        subject: whose avatar.
-        own: the study's own words.
-        knobs: what was turned.
-        entries: in the order of their making; the first is the base.
-        expected: preset -> expected cost, of those that were not made.
-        fits: registrations.
-        budget: seconds.
-        seconds: of this call.
+        base: whose avatar, and the study's own settings.
+        points: indexed by number, in the order of their making; 1 is the base. A column for each of
+            ``COLUMNS``: quality over the base's held-out frames at the base's picture size, processor
+            seconds, milliseconds. And ``result``; ``design``, None for a preset; ``preset``, which it is,
+            empty if none; ``label``; ``chance``, true of another seed, which is no choice.
+        expected: preset -> expected training cost, of those that were not run.
+        fits: indexed by steps, with the columns of ``fit_numbers``.
+        budget, seconds: allowed, and taken by this call.
     """
 
-    subject: str
-    own: Mapping[str, str]
-    knobs: Sequence[Knob]
-    entries: Sequence[Entry]
+    base: Base
+    points: pd.DataFrame
     expected: Mapping[str, float]
-    fits: Sequence[FitPoint]
+    fits: pd.DataFrame
     budget: float
     seconds: float
 
     @property
-    def base(self) -> Entry:
-        """The study's own settings."""
-        return self.entries[0]
+    def choices(self) -> pd.DataFrame:
+        """The points that a user can choose from."""
+        return self.points[~self.points["chance"]]
 
     @property
     def noise(self) -> float:
         """How far another seed's PSNR is off; NaN where it was not reached."""
-        apart = [
-            abs(entry.get("psnr") - self.base.get("psnr")) for entry in self.entries if self.by_chance(entry)
-        ]
-        return apart[0] if apart else math.nan
+        return self.points.loc[self.points["chance"], "gain"].abs().max()
 
-    def by_chance(self, entry: Entry) -> bool:
-        """Whether an entry is the base with another seed: it shows what chance is worth, and is no choice."""
-        place = [knob.name for knob in self.knobs].index(CHANCE)
-        return bool(entry.point and entry.point[place])
-
-    @property
-    def choices(self) -> list[Entry]:
-        """The entries that a user can choose from."""
-        return [entry for entry in self.entries if not self.by_chance(entry)]
-
-    def edge(self, cost: str = "train", metric: str = "psnr") -> set[int]:
-        """The numbers of the entries on the frontier.
-
-        Args:
-            cost: ``train`` or ``animation_ms``.
-            metric: of the quality; LPIPS's sign is turned.
-        """
-        choices, sign = self.choices, -1 if metric.startswith("lpips") else 1
-        costs = [self.costs(entry, cost) for entry in choices]
-        qualities = [sign * entry.get(metric) for entry in choices]
-        return {choices[place].number for place in frontier(costs, qualities)}
-
-    @staticmethod
-    def costs(entry: Entry, cost: str) -> float:
-        """What an entry is plotted over."""
-        return entry.cost if cost == "train" else entry.speed.get(cost, math.nan)
-
-    def short(self, entry: Entry) -> float:
-        """How much PSNR an entry lacks against what costs no more."""
-        costs, qualities = ([one.cost for one in self.choices], [one.get("psnr") for one in self.choices])
-        return short_of(entry.cost, entry.get("psnr"), costs, qualities)
+    def frontier(self, cost: str = "train_s", metric: str = "psnr") -> list[int]:
+        """The numbers of the points that nothing beats, the cheapest first."""
+        sign = -1 if metric.startswith("lpips") else 1
+        return list(frontier(self.choices[cost], sign * self.choices[metric]))
 
 
-def tradeoff(subject: str, words: Mapping[str, str]) -> Path:
+def tradeoff(subject: str, request: Request) -> Path:
     """Explores one subject's settings and writes table, plots and page.
 
     Returns:
         The study's folder.
 
     Raises:
-        UserError: a word is wrong, or the base itself failed.
+        UserError: a setting is wrong, or the base itself failed.
     """
-    workspace, start = workspace_from_words(words), time.monotonic()
-    budget, own = seconds_of(words.get("budget", DEFAULT_BUDGET)), base_words(subject, words)
-    knobs, folder = (
-        knobs_of(job_from_words(subject, own).settings),
-        study_folder(workspace, "tradeoff", subject),
-    )
-    judge = Judging(words)
-    explorer = Explorer(subject, own, knobs, budget, folder / "log.txt", judge)
-    told = f"{len(singles(knobs))} levels of {len(knobs)} knobs, then what combines"
-    print(f"tradeoff of {subject}: {told}, within {words.get('budget', DEFAULT_BUDGET)}", flush=True)
-    presets = explore(explorer, stage_words(words), workspace)
-    study = gathered(explorer, presets, judge, words, time.monotonic() - start)
+    text = request.budget or DEFAULT_BUDGET
+    budget, folder = seconds_of(text), study_folder(request, "tradeoff", subject)
+    base = base_of(subject, request, folder / "log.txt")
+    levels = sweep_levels(base.settings)
+    print(f"tradeoff of {subject}: {len(levels)} levels alone, then what combines, within {text}", flush=True)
+    meters: list[AvatarMeter] = []
 
-    from pipeline.studies.tradeoff_report import publish
+    def quality(result: Result) -> Numbers:
+        if not meters:  # the first result is the base's
+            meters.append(AvatarMeter(base.job(), result.folders["ingest"]))
+        return meters[0].quality(result)
 
-    publish(folder, study)
+    search = Search(base, budget, lambda result: quality(result).get("psnr", math.nan))
+    own = search.make(())
+    if own.failure:
+        raise UserError(own.failure)
+    fits = run_fits(search)
+    search.make_affordable((level,) for level in levels)
+    presets, expected = run_presets(search, levels)
+    search.make_affordable(combinations(search.alone(), search.noise))
+
+    runs = [(result, design, "" if design else base.preset) for design, result in search.results.items()]
+    runs += [(result, None, preset) for preset, result in presets.items()]
+    done = [result for result, _, _ in runs if not result.failure]
+    print(f"timing {len(done)} avatars in motion", flush=True)
+    speeds = meters[0].speeds(done)
+    measured = [{} if one.failure else quality(one) | speeds[one.folders[TRAIN].name] for one, _, _ in runs]
+    points = point_table(runs, measured)
+    write_tradeoff(folder, Tradeoff(base, points, expected, fits, budget, search.spent))
     return folder
 
 
-class Judging:
-    """Held-out quality at the base's picture size, by evaluate's metrics but without that stage's pictures.
+def run_fits(search: Search) -> pd.DataFrame:
+    """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
+    own, rows = search.base.settings["fit"].iterations, {}
+    for steps in fit_steps(own):
+        overrides = {"fit.iterations": str(steps)}
+        seconds = search.results[()].seconds["fit"] * steps / own
+        late = search.spent + seconds > search.budget / 4
+        if rows and late and search.base.missing("fit", overrides):
+            print(f"fit of {steps} steps is left out: the budget")
+            continue
+        result = search.base.run(Variant(f"fit of {steps} steps", overrides), ["fit"])
+        if result.failure:
+            print(f"fit of {steps} steps failed: {result.failure}")
+        else:
+            rows[steps] = fit_numbers(search.base, result)
+    return pd.DataFrame.from_dict(rows, orient="index")
 
-    Evaluate would cost as much as a short training; and it measures at the size that was learnt from.
+
+def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Result], dict[str, float]]:
+    """The presets that the store holds or half of the budget's rest reaches; the others' expected cost."""
+    own = search.results[()]
+    results, expected = {}, {}
+    for path in sorted((search.base.request.workspace.data / "presets").glob("*.toml")):
+        base = search.base.under_preset(path.stem)
+        expected[path.stem] = expected_cost(search, base.job(), levels)
+        seconds = expected[path.stem] * sum(own.seconds.values()) / max(training_cost(own), 1e-9)
+        if base.missing(TRAIN, {}) and seconds > (search.budget - search.spent) / 2:
+            continue
+        result, _ = search.run(base, Variant(f"preset {path.stem}"))
+        if not result.failure:
+            results[path.stem] = result
+            del expected[path.stem]
+    return results, expected
+
+
+def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
+    """Processor seconds that training under a job's settings would cost, from the levels tried alone.
+
+    Iterations count in proportion, levels of subdivision and precision by what they were found to cost.
     """
-
-    def __init__(self, words: Mapping[str, str]) -> None:
-        self.words = words
-        self.base: Outcome | None = None
-        self._clip: Clip | None = None
-
-    def clip(self, base: Outcome) -> Clip:
-        """What avatars are measured on."""
-        from pipeline.studies.measured import clip_of  # torch, which the DAG does without
-
-        if self._clip is None:
-            self._clip = clip_of(base, self.words, workspace_from_words(self.words))
-        return self._clip
-
-    def qualities(self, outcome: Outcome) -> dict[str, float]:
-        """Metric -> mean over the base's held-out frames."""
-        base = self.base = self.base or outcome
-        from pipeline.studies.clip import quality, quality_name
-        from pipeline.studies.measured import notes_of
-
-        clip = self.clip(base)
-        notes = notes_of(workspace_from_words(self.words), outcome.subject)
-        return notes.once(quality_name(outcome, clip), lambda: quality(outcome, clip))
-
-    def __call__(self, outcome: Outcome) -> float:
-        """PSNR."""
-        return self.qualities(outcome).get("psnr", math.nan)
+    own, wanted, result = search.base.settings["train"], job.settings["train"], search.results[()]
+    cost = training_cost(result)
+    marks = run_record(result.folders[TRAIN])["timings"].get("curve_seconds") or [(0, 0.0, cost)]
+    iterating = float(marks[-1][2])  # the rest is spent before and after the iterations
+    cost += iterating * (wanted.iterations / own.iterations - 1)
+    fields = {GAUSSIANS: "subdivisions", PRECISION: "half_precision"}
+    for level in levels:
+        field = fields.get(level.parameter, "")
+        if field and dict(level.overrides)[f"train.{field}"] == str(getattr(wanted, field)).lower():
+            cost *= search.cost_ratio(level) if getattr(wanted, field) != getattr(own, field) else 1.0
+    return cost
 
 
-def gathered(
-    explorer: Explorer, presets: Sequence[Preset], judge: Judging, words: Mapping[str, str], seconds: float
-) -> Study:
-    """The study, with what a frame of each avatar costs."""
-    from pipeline.studies.clip import speeds
-    from pipeline.studies.measured import notes_of
+def point_table(
+    runs: Sequence[tuple[Result, Design | None, str]], measured: Sequence[Mapping[str, float]]
+) -> pd.DataFrame:
+    """The points, as ``Tradeoff`` describes them.
 
-    outcomes = [one for one in explorer.endings.values() if isinstance(one, Outcome)]
-    outcomes += [preset.outcome for preset in presets if preset.outcome]
-    explorer.say(f"timing {len(outcomes)} avatars in motion")
-    notes = notes_of(workspace_from_words(words), explorer.subject)
-    fast = speeds(outcomes, judge.clip(outcomes[0]), notes)
-    entries: list[Entry] = []
-    for point, ending in explorer.endings.items():
-        label = label_of(explorer.knobs, point)
-        entries.append(
-            _entry(len(entries) + 1, label, words_of(explorer.knobs, point), ending, judge, fast, point)
-        )
-    for preset in presets:
-        if preset.outcome:
-            words_in = {"preset": preset.name}
-            entry = _entry(
-                len(entries) + 1, f"preset {preset.name}", words_in, preset.outcome, judge, fast, None
-            )
-            entries.append(dataclasses.replace(entry, preset=preset.name))
-    if is_preset(words):
-        entries[0] = dataclasses.replace(entries[0], preset=words.get("preset", DEFAULT_PRESET))
-    return Study(
-        subject=explorer.subject,
-        own=explorer.own,
-        knobs=explorer.knobs,
-        entries=entries,
-        expected={preset.name: preset.cost for preset in presets if preset.outcome is None},
-        fits=explorer.fits,
-        budget=explorer.budget,
-        seconds=seconds,
+    Args:
+        runs: result, design and preset of each, the base's first.
+        measured: quality and speed of each; empty where it failed.
+    """
+    points = pd.DataFrame(measured, index=range(1, len(runs) + 1))
+    points = points.reindex(columns=COLUMNS).astype(float)
+    points["result"], points["design"], points["preset"] = (
+        pd.Series(list(values), points.index, dtype=object) for values in zip(*runs, strict=True)
     )
+    points["train_s"] = points["result"].map(training_cost).astype(float)
+    points["whole_s"] = [pd.Series(r.cpu_seconds, dtype=float).sum(min_count=1) for r in points["result"]]
+    points["times"] = points["train_s"] / points["train_s"].iloc[0]
+    points["gain"] = points["psnr"] - points["psnr"].iloc[0]
+    points["label"] = [result.variant for result in points["result"]]
+    points["chance"] = [bool(d) and d[0].parameter == CHANCE for d in points["design"]]
+    choices = points[~points["chance"]]
+    points["short"] = shortfalls(choices["train_s"], choices["psnr"])
+    return points
 
 
-def is_preset(words: Mapping[str, str]) -> bool:
-    """Whether the base is a preset as it is."""
-    settings = [name for name in words if "." in name and not name.startswith("evaluate.")]
-    return not settings and words.get("scale", "preset") == "preset"
+def numbered(points: pd.DataFrame) -> pd.DataFrame:
+    """The points, indexed by ``number. label``."""
+    return points.set_axis(points.index.astype(str) + ". " + points["label"])
 
 
-def _entry(
-    number: int,
-    label: str,
-    words: Mapping[str, str],
-    ending: Outcome | Failure,
-    judge: Judging,
-    fast: Mapping[str, Mapping[str, float]],
-    point: Point | None,
-) -> Entry:
-    if isinstance(ending, Failure):
-        return Entry(number, label, words, None, ending.reason, {}, {}, math.nan, point)
-    speed = fast.get(ending.folders["train"].name, {})
-    return Entry(number, label, words, ending, "", judge.qualities(ending), speed, cost_of(ending), point)
-
-
-def sentence(study: Study) -> str:
-    """What a user can act on: the knob that gives the most for its time, and the one that gives the most."""
-    base, noise = study.base, study.noise
-    least = noise if math.isfinite(noise) else 0.0
-    alone = [entry for entry in study.entries if entry.point and sum(map(bool, entry.point)) == 1]
-    known = [
-        (entry, entry.get("psnr") - base.get("psnr"), entry.cost / base.cost)
-        for entry in alone
-        if math.isfinite(entry.get("psnr")) and not study.by_chance(entry)
+def write_tradeoff(folder: Path, study: Tradeoff) -> None:
+    """Writes the tables, the plots and the page."""
+    tables, points = tables_of(study), numbered(study.points)
+    failed = [result.variant for result in points["result"] if result.failure]
+    changed = {
+        name: {"preset": point["preset"]} if point["design"] is None else overrides_of(point["design"])
+        for name, point in points.iterrows()
+    }
+    lines = [
+        f"Settings that were tried within {spoken(study.budget)}: {len(points)}; each level of each sweep "
+        "parameter alone, then combinations of those that gained most for their time. Gains smaller than "
+        "another seed's difference mean nothing.",
+        *([f"Failed: {', '.join(failed)}; the table says why."] if failed else []),
     ]
-    if not known:
+    page = Page(
+        title=f"{study.base.subject}: what accuracy costs",
+        lead=headline(study),
+        lines=lines,
+        sections=[
+            Section("The frontier", frontier_lines(study), pictures=plots(folder, study)),
+            *(Section(table.title, tables=[table]) for table in tables),
+            settings_section(study.base.settings, changed),
+            timings_section(points["result"].to_dict(), study.seconds),
+        ],
+    )
+    publish(folder, page, tables, pd.concat([table.values(study.base.subject) for table in tables]))
+
+
+def tables_of(study: Tradeoff) -> list[Table]:
+    """The points, and the registrations."""
+    noise = study.noise
+    chance = f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
+    caption = (
+        f"{sizes_of(study.base.settings)} Quality: means over held-out frames, all at the base's picture "
+        "size. Seconds are processor seconds of all threads, of the run that made the result; training "
+        "includes the views that were made for it, the whole job all up to training. Milliseconds: the baked "
+        "avatar on one thread, the least of 15 frames, drawn at 512×512. In bold letters: on the frontier of "
+        f"PSNR and training seconds.{chance}"
+    )
+    points = study.points
+    failures = points["result"].map(lambda one: one.failure and f"failed: {one.failure}")
+    presets = ("preset " + points["preset"]).where(points["preset"].ne("") & points["design"].notna(), "")
+    rows = points.assign(**{NOTE: failures + presets, MAIN: points.index.isin(study.frontier())})
+    rows = numbered(rows)[[*COLUMNS, NOTE, MAIN]]
+    tables = [Table("tradeoff", f"What accuracy costs: {study.base.subject}", caption, rows)]
+    if not study.fits.empty:
+        told = (
+            f"Seconds ({' and '.join(sorted(set(study.fits['clock'])))}) of the registration alone. px: mean "
+            "distance of the trusted keypoints from where they were detected; mm: of the joints that the "
+            "camera sees from the truth, aligned at the neck."
+        )
+        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps")
+        tables.append(
+            Table("fits", "What the fit's effort buys", told, fits.drop(columns="clock"), first="fit")
+        )
+    return tables
+
+
+PLOTS = (
+    # file, cost, metric, label of the costs, label of the metric
+    ("psnr_over_training", "train_s", "psnr", "training, views included: processor seconds", "PSNR, dB"),
+    (
+        "lpips_over_training",
+        "train_s",
+        "lpips_alex",
+        "training, views included: processor seconds",
+        "LPIPS×100",
+    ),
+    ("psnr_over_animation", "animation_ms", "psnr", "animating a frame: processor milliseconds", "PSNR, dB"),
+)
+FIT_PLOTS = (
+    ("fit_pixels", "pixels", "Reprojection error, px"),
+    ("fit_millimetres", "millimetres", "Joints' distance from the truth, mm"),
+)
+
+
+def plots(folder: Path, study: Tradeoff) -> list[Picture]:
+    """Draws every plot there is something for."""
+    points = study.points.assign(base=study.points.index == 1)
+    pictures = []
+    for name, cost, metric, across, up in PLOTS:
+        shown = points.assign(x=points[cost], y=points[metric] * (100 if metric == "lpips_alex" else 1))
+        expected = study.expected if cost == "train_s" else {}
+        scatter(
+            folder / f"{name}.png", shown, study.frontier(cost, metric), across, f"held-out {up}", expected
+        )
+        dashed = " Dashed: what a preset that was not run would cost, if near." if expected else ""
+        told = f"Held-out {up.partition(',')[0]} against {across.partition(':')[0]}. Numbers are the table's."
+        pictures.append((folder / f"{name}.png", told + dashed))
+    file, told = folder / "training_curves.png", (
+        "Training curves of every run that learnt from the base's pictures; the frontier's in colour. "
+        "Wall-clock seconds carry what else the machine was doing."
+    )  # fmt: skip
+    curves(
+        file, training_curves(study), "wall-clock seconds of training", "PSNR of a few held-out frames, dB"
+    )
+    pictures.append((file, told))
+    for name, error, up in FIT_PLOTS if len(study.fits) else ():
+        if study.fits[error].notna().any():
+            shown = study.fits.assign(x=study.fits["seconds"], y=study.fits[error])
+            edge = frontier(shown["x"], -shown["y"])
+            scatter(folder / f"{name}.png", shown, edge, "seconds of registration", up)
+            told = f"{up.partition(',')[0]} against the registration's seconds; numbers are steps."
+            pictures.append((folder / f"{name}.png", told))
+    return pictures
+
+
+def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
+    """Label -> (wall-clock seconds, PSNR) of a few held-out frames; the base and the frontier's best first.
+
+    A curve is of pictures of its own run's size, so that runs of other sizes are left out.
+    """
+    edge = study.frontier()
+    order = sorted(study.points.index, key=lambda n: (n != 1, n not in edge, -study.points["psnr"][n]))
+    results, lines = numbered(study.points.loc[order])["result"], {}
+    for name, result in results.items():
+        if result.folders.get("ingest") == results.iloc[0].folders["ingest"]:
+            train, remedy = result.folders[TRAIN], "run the train stage again"
+            seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"].get("curve_seconds", [])}
+            line = read_curve(train / "curve.parquet", remedy).get("psnr", [])
+            lines[name] = [(seconds[step], value) for step, value in line if step in seconds]
+    return lines
+
+
+def frontier_lines(study: Tradeoff) -> list[str]:
+    """The frontier in words, the cheapest first, and how far presets lie from it."""
+    points, edge = numbered(study.points), study.frontier()
+    lines = [
+        f"{name}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
+        for name, point in points.iloc[[number - 1 for number in edge]].iterrows()
+    ]
+    for number, point in study.points[study.points["preset"].ne("")].iterrows():
+        where = "on" if number in edge else f"{point['short']:.2f} dB under"
+        lines.append(f"Preset {point['preset']} lies {where} the frontier.")
+    return lines + [
+        f"Preset {name} was not run: about {spoken(cost)}." for name, cost in study.expected.items()
+    ]
+
+
+def headline(study: Tradeoff) -> str:
+    """One sentence: the level that gains most for its time, the one that gains most; else what is as good."""
+    single = study.choices["design"].map(lambda design: len(design or ()) == 1)
+    levels, base = study.choices[single & study.choices["psnr"].notna()], study.points.loc[1]
+    if levels.empty:
         return "The budget reached no setting but the study's own: give it more time."
-    gaining = [one for one in known if one[1] > least]
-    if not gaining:
-        chance = f"more than another seed does ({least:.1f} dB)" if math.isfinite(noise) else "anything"
-        return f"No single change that was tried gains {chance}: {_told_cheapest(study, least)}."
-    worth = max(gaining, key=lambda one: one[1] / max(math.log(max(one[2], 1.02)), 1e-3))
-    most = max(gaining, key=lambda one: one[1])
-    text = _told(study, *worth)
-    if most[0] is not worth[0]:
-        text += f"; the most is gained by {_told(study, *most, first=False)}"
-    return f"{text}."
+    noise = max(study.noise, 0.0)
+    gaining = levels[levels["gain"] > noise]
+    if gaining.empty:
+        chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"
+        as_good = study.choices[study.choices["gain"] >= -noise].sort_values("train_s", kind="stable").iloc[0]
+        perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
+        instead = (
+            f"stay with {base['gaussians']:,.0f} Gaussians and {sizes_of(study.base.settings)}"
+            if as_good["times"] > 0.95
+            else f"{as_good['label']}, at {times(as_good)}, does as well in PSNR ({perceived})"
+        )
+        return f"No single change that was tried gains {chance}: {instead}."
+    worth = [gain_for_time(one.gain, one.times) for one in gaining.itertuples()]
+    best, most = gaining.iloc[int(np.argmax(worth))], gaining.loc[gaining["gain"].idxmax()]
+    more = (
+        ""
+        if most is best or most.name == best.name
+        else f"; the most is gained by going {change(most, base)}"
+    )
+    return f"Going {change(best, base)}{more}."
 
 
-def _told(study: Study, entry: Entry, gain: float, ratio: float, first: bool = True) -> str:
-    place = next(place for place, level in enumerate(entry.point or ()) if level)
-    knob = study.knobs[place]
-    before, after = knob.levels[0].label, knob.levels[(entry.point or ())[place]].label
-    if knob.name == "number of Gaussians" and math.isfinite(entry.gaussians + study.base.gaussians):
-        before, after = (f"{one.gaussians:,.0f} Gaussians" for one in (study.base, entry))
-    time = f"{ratio:.1f} times the training time" if abs(ratio - 1) > 0.05 else "no more training time"
-    change = after if after.startswith("with") else f"from {before} to {after}"
-    return f"{'Going' if first else 'going'} {change}, at {time}: {gain:+.1f} dB"
+def change(point: pd.Series, base: pd.Series) -> str:
+    """A level tried alone in words: from what to what, at how much time, for what gain."""
+    level = point["design"][0]
+    before, after = level.before, level.label
+    if level.parameter == GAUSSIANS:
+        before, after = (f"{one['gaussians']:,.0f} Gaussians" for one in (base, point))
+    told = after if after.startswith("with") else f"from {before} to {after}"
+    return f"{told}, at {times(point)}: {point['gain']:+.1f} dB"
 
 
-def _told_cheapest(study: Study, least: float) -> str:
-    """The cheapest entry that is no worse than the base by more than chance, at the price of what."""
-    base = study.base
-    as_good = [one for one in study.choices if one.get("psnr") >= base.get("psnr") - least]
-    cheapest = min(as_good, key=lambda one: one.cost)
-    if cheapest.cost > 0.95 * base.cost:
-        return f"stay with {told_size(study, base)}"
-    perceived = f"LPIPS×100 {100 * cheapest.get('lpips_alex'):.1f}, was {100 * base.get('lpips_alex'):.1f}"
-    time = f"{cheapest.cost / base.cost:.1f} times the training time"
-    return f"{cheapest.label}, at {time}, does as well in PSNR ({perceived})"
-
-
-def told_size(study: Study, entry: Entry) -> str:
-    """An entry's size in words."""
-    return f"{entry.gaussians:,.0f} Gaussians and {study.knobs[0].levels[0].label}"
+def times(point: pd.Series) -> str:
+    """A point's training time over the base's, in words."""
+    same = abs(point["times"] - 1) <= 0.05
+    return "no more training time" if same else f"{point['times']:.1f} times the training time"

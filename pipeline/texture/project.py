@@ -9,7 +9,7 @@ median is taken, then the mean of what lies near it: a frame that slipped is out
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pipeline.body import rasterize, vertex_normals
 from pipeline.camera import Camera, project, to_camera
+from pipeline.clip import FittedClip
 from pipeline.texture.surface import FineSurface
 
 GRAZING = 0.25  # cosine of the angle between normal and view under which nothing is believed
@@ -25,23 +26,6 @@ DEPTH = 0.012  # metres behind the nearest surface at which a vertex still count
 EDGE = 0.012  # of the person's height: what lies nearer to the mask's edge is not believed
 AGREEING = 24.0  # of 255: samples within this distance of the median are averaged
 SURE = 0.02  # summed weight from which a vertex is known; a frontal view at full resolution weighs 1
-
-
-@dataclasses.dataclass(frozen=True)
-class View:
-    """One frame of the clip with the fitted body in it.
-
-    Attributes:
-        camera: of the frame.
-        vertices: [V, 3], the body's, metres, in the world.
-        image: [H, W, 3] uint8 RGB.
-        mask: [H, W] uint8, the person's soft alpha.
-    """
-
-    camera: Camera
-    vertices: Tensor
-    image: np.ndarray
-    mask: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,20 +45,31 @@ class Seen:
     normal: np.ndarray
 
 
-def gather(surface: FineSurface, views: Iterable[View], count: int) -> Seen:
-    """Colours of all vertices.
+@torch.no_grad()
+def gather(
+    surface: FineSurface,
+    clip: FittedClip,
+    frames: Sequence[int],
+    advance: Callable[[], object] = lambda: None,
+) -> Seen:
+    """The colours that some frames of a clip show of all vertices.
 
     Args:
-        surface: the fine mesh.
-        views: the frames, each asked for once.
-        count: how many they are.
+        surface: the fine mesh of the clip's body.
+        clip: the clip.
+        frames: which of its frames.
+        advance: called after each frame.
     """
+    count = len(frames)
     colors = np.zeros((count, len(surface), 3), np.uint8)
     weights = np.zeros((count, len(surface)), np.float32)
     normal = np.zeros((len(surface), 3), np.float32)
-    for row, view in enumerate(views):
-        colors[row], weights[row] = look(surface, view)
-        normal += surface.refine(vertex_normals(view.vertices, surface.coarse)).numpy()
+    for row, frame in enumerate(frames):
+        vertices = clip.vertices(frame)
+        pictures = clip.frame(frame), clip.mask(frame)
+        colors[row], weights[row] = look(surface, clip.camera(frame), vertices, *pictures)
+        normal += surface.refine(vertex_normals(vertices, surface.coarse)).numpy()
+        advance()
     largest = weights.max()
     weights /= max(float(largest), 1e-12)
     color = robust_mean(colors, weights)
@@ -82,19 +77,31 @@ def gather(surface: FineSurface, views: Iterable[View], count: int) -> Seen:
     return Seen(color, weight, weight > SURE, normal / np.float32(max(1, count)))
 
 
-def look(surface: FineSurface, seen: View) -> tuple[np.ndarray, np.ndarray]:
-    """What one frame shows of the vertices: colours [N, 3] uint8 and weights [N] float32."""
-    camera, vertices = seen.camera, seen.vertices
+def look(
+    surface: FineSurface,
+    camera: Camera,
+    vertices: Tensor,  # [V, 3]
+    image: np.ndarray,  # [H, W, 3] uint8
+    mask: np.ndarray,  # [H, W] uint8
+) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices' colours in one frame, [N, 3] uint8, and how much they count, [N] float32.
+
+    Args:
+        surface: the fine mesh.
+        camera: of the frame.
+        vertices: the body's, metres, in the world.
+        image: the frame, RGB.
+        mask: the person's soft alpha.
+    """
     fine = surface.refine(vertices)
     normals = surface.refine(vertex_normals(vertices, surface.coarse)).numpy()
     view = camera.centre.numpy() - fine.numpy()
     distance = np.linalg.norm(view, axis=1)
     cosine = (normals * view).sum(1) / np.maximum(np.linalg.norm(normals, axis=1) * distance, 1e-9)
-    with torch.no_grad():
-        pixels = project(camera, fine).numpy().astype(np.float32)
-        depth = to_camera(camera, fine)[:, 2].numpy()
+    pixels = project(camera, fine).numpy().astype(np.float32)
+    depth = to_camera(camera, fine)[:, 2].numpy()
     nearest = _smallest(rasterize(camera, vertices, surface.coarse).depth)
-    inner = _inner(seen.mask)
+    inner = _inner(mask)
     columns, rows = np.floor(pixels).astype(int).T
     inside = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height) & (depth > 0)
     columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
@@ -103,7 +110,7 @@ def look(surface: FineSurface, seen: View) -> tuple[np.ndarray, np.ndarray]:
     pixel = depth / float(camera.intrinsics[0, 0])
     hidden = depth > nearest[rows, columns] + DEPTH + slope * pixel
     good = inside & ~hidden & (cosine > GRAZING) & inner[rows, columns]
-    sampled = sample(seen.image, pixels)
+    sampled = sample(image, pixels)
     resolution = 1 / np.maximum(pixel, 1e-6) ** 2
     weight = np.where(good, ((cosine - GRAZING) / (1 - GRAZING)) ** 2 * resolution, 0)
     return sampled, weight.astype(np.float32)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, Surface, pose_features
 from pipeline.avatar.bake import BakedAvatar, bake
-from pipeline.body import PARTS, BodyModel, Poses, part_labels
+from pipeline.body import PARTS, BodyModel, Pose, Poses, part_labels
 from pipeline.splat import Gaussians
 
 _LEGS = ("left_leg", "right_leg")
@@ -33,9 +33,9 @@ class Known:
         features = torch.stack([pose_features(poses.rotation[row]) for row in rows])
         return cls(features.amin(0), features.amax(0))
 
-    def nearest(self, rotation: Tensor) -> Tensor:
-        """What the heads are told of a pose [55, 3]: the nearest that lies in the range, [324]."""
-        return pose_features(rotation).clamp(self.low, self.high)
+    def nearest(self, pose: Pose) -> Tensor:
+        """What the heads are told of a pose: the nearest that lies in the range, [324]."""
+        return pose_features(pose.rotation).clamp(self.low, self.high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,22 +61,17 @@ class Actor:
         return len(self.parts)
 
     @torch.no_grad()
-    def gaussians(self, rotation: Tensor, expression: Tensor, transl: Tensor) -> Gaussians:
+    def gaussians(self, pose: Pose) -> Gaussians:
         """The avatar in a pose, world coordinates.
 
         There is no clock: the motion was not filmed (see ``pipeline.avatar.residual``).
-
-        Args:
-            rotation: [55, 3] rotation vectors, radians.
-            expression: [E].
-            transl: [3], metres.
         """
-        theta = self.known.nearest(rotation) if self.known is not None else None
+        theta = self.known.nearest(pose) if self.known is not None else None
         source = self.avatar if self.baked is None else self.baked
-        seen = source.gaussians(rotation, expression, transl, time=None, theta=theta)
+        seen = source.gaussians(pose, time=None, theta=theta)
         if self.extra is None:
             return seen
-        bare = self.avatar.bare(self.extra, rotation, expression, transl)
+        bare = self.avatar.bare(self.extra, pose)
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
 

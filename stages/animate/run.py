@@ -14,24 +14,28 @@ import torch
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
 from pipeline.camera import Camera
+from pipeline.composite import over, to_bytes
 from pipeline.frames import write_png, write_video
+from pipeline.json_files import write_json
 from pipeline.motion.names import TURNTABLE, motion_name
 from pipeline.motion.place import place
 from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
 from pipeline.motion.record import Span
+from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
-from pipeline.records import read_cameras, read_split, write_cameras, write_json
+from pipeline.records import read_cameras, read_split, write_cameras
 from pipeline.splat import Gaussians, Rendering, render, write_ply
+from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context
 from stages.animate.actor import Actor, Known, legs_share, make_actor
 from stages.animate.layers import NAMES, layers_of, write_layers
 from stages.animate.script import Script, cameras_of, origin_of, turntable
 from stages.animate.settings import AnimateSettings
-from stages.animate.sheet import contact_sheet
 
 _HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
 _WORTH_BAKING = 24  # poses; baking 54,000 Gaussians takes as long as it saves in about so many
 _SHOWN = 12  # joints named in a line
+_SHEET_COLUMNS, _SHEET_SIDE = 4, 320  # of frames.png; pixels of a picture's longer side
 
 
 def run(context: Context) -> None:
@@ -91,8 +95,7 @@ def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
 
 def posed(script: Script, actor: Actor, frame: int) -> Gaussians:
     """The Gaussians of a frame."""
-    placed = script.placed
-    return actor.gaussians(placed.rotation[frame], placed.expression[frame], placed.transl[frame])
+    return actor.gaussians(script.placed.pose(frame))
 
 
 def shots(context: Context, script: Script, actor: Actor, body: BodyModel) -> list[Camera]:
@@ -126,7 +129,9 @@ def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) 
         else:
             for _ in pictures():
                 pass
-    write_png(context.output / "frames.png", contact_sheet(kept))
+    small = [shrunk(picture, _SHEET_SIDE) for picture in kept.values()]
+    columns = min(_SHEET_COLUMNS, len(small))
+    write_png(context.output / "frames.png", contact_sheet(small, columns, list(kept), PAPER, gap=4))
     each = {name: round(1e3 * statistics.median(times), 3) for name, times in spent.items()}
     context.timing("milliseconds_a_frame", each)
 
@@ -163,8 +168,7 @@ def drawn(
 
 def on_background(rendering: Rendering, color: tuple[float, float, float]) -> np.ndarray:
     """The video's picture, mixed as the clip's colours are encoded: [H, W, 3] uint8 RGB."""
-    image = rendering.color + (1 - rendering.alpha[..., None]) * torch.tensor(color)
-    return (image.clamp(0, 1) * 255).round().byte().numpy()
+    return to_bytes(over(rendering.color, rendering.alpha, torch.tensor(color)))
 
 
 class _Clock:
@@ -181,7 +185,7 @@ class _Clock:
 
 def sheet_rows(count: int, wanted: int) -> set[int]:
     """The frames on the contact sheet, evenly spaced, first and last included."""
-    return {int(row) for row in np.linspace(0, count - 1, min(count, wanted)).round()}
+    return {0} if wanted == 1 else set(spread_end_to_end(range(count), wanted))
 
 
 def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float) -> dict[str, Any]:

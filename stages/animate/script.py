@@ -13,12 +13,13 @@ from pipeline.camera import Camera, facing_camera
 from pipeline.motion.place import Placed
 from pipeline.motion.record import Motion
 from pipeline.splat import Gaussians
+from pipeline.spread import spread_end_to_end
 from pipeline.turntable import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
 from stages.animate.settings import AnimateSettings
 
 _SAMPLES = 24  # frames that are looked at to place a camera
 
-Pose = Callable[[int], Gaussians]
+PosedFrame = Callable[[int], Gaussians]
 """Frame -> Gaussians in world coordinates."""
 
 
@@ -77,13 +78,13 @@ def origin_of(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identit
 
 
 def cameras_of(
-    script: Script, pose: Pose, settings: AnimateSettings, origin: Origin, pelvis: torch.Tensor
+    script: Script, posed: PosedFrame, settings: AnimateSettings, origin: Origin, pelvis: torch.Tensor
 ) -> list[Camera]:
     """A camera a frame.
 
     Args:
         script: what is shown.
-        pose: makes Gaussians of its frames.
+        posed: makes Gaussians of its frames.
         settings: the stage's.
         origin: of the person's own clip.
         pelvis: [3], metres, where the pelvis is in the script's first frame.
@@ -92,9 +93,9 @@ def cameras_of(
     if settings.camera == "clip":
         return [clip_camera(origin, pelvis, *size)] * count
     if script.still:
-        return orbit(visible_extent(pose(0)), *size, count, settings.turns)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int))
-    boxes = np.stack([visible_box(pose(int(row))) for row in rows])
+        return orbit(visible_extent(posed(0)), *size, count, settings.turns)
+    rows = spread_end_to_end(range(count), _SAMPLES)
+    boxes = np.stack([visible_box(posed(row)) for row in rows])
     if settings.camera == "orbit":
         return orbit(extent_of(boxes), *size, count, settings.turns)
     return [front_camera(boxes, *size)] * count

@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from pipeline.body import Landmarks, Poses, pose_body
+from pipeline.body import Landmarks, Poses, pose_frame, posed_vertices
 from pipeline.camera import Camera
+from pipeline.clip import FittedClip
 from pipeline.frames import read_mask, write_frame, write_mask
 from stages.auxiliary import check
 from stages.auxiliary.look import Look, Watcher
 from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.register import register
 from stages.auxiliary.skeleton import driven_keypoints
-from stages.auxiliary.turn import Clip
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -50,20 +48,22 @@ class Accepted:
     notes: tuple[str, ...] = ()
 
 
-def accept_exact(context: Context, clip: Clip, landmarks: Landmarks, offer: Offer, total: int) -> Accepted:
+def accept_exact(
+    context: Context, clip: FittedClip, landmarks: Landmarks, offer: Offer, total: int
+) -> Accepted:
     """Take an offer whose pictures show their poses by construction; its keypoints are the poses' own."""
     folder, frames, points = _made(context), [], []
     with context.progress(total, "frames") as progress:
         for picture in offer.pictures:
             _keep(folder, picture, picture.mask)
-            vertices, joints = posed(clip, offer.poses, offer.poses.index(picture.frame))
+            vertices, joints = pose_frame(clip.body, clip.identity, offer.poses.pose(picture.frame))
             camera = offer.cameras[picture.frame]
             points.append(driven_keypoints(clip, landmarks, joints, vertices, camera))
             frames.append(picture.frame)
             progress.advance()
     return Accepted(
         folder=folder,
-        poses=rows_of(offer.poses, frames),
+        poses=offer.poses.select(frames),
         cameras={frame: offer.cameras[frame] for frame in frames},
         keypoints=np.stack(points) if points else np.zeros((0, 133, 3), np.float32),
         offered=len(frames),
@@ -72,7 +72,7 @@ def accept_exact(context: Context, clip: Clip, landmarks: Landmarks, offer: Offe
     )
 
 
-def accept_checked(context: Context, clip: Clip, landmarks: Landmarks, offer: Offer) -> Accepted:
+def accept_checked(context: Context, clip: FittedClip, landmarks: Landmarks, offer: Offer) -> Accepted:
     """Look at an offer, throw out what does not fit, and register the rest."""
     settings, folder, watcher = context.settings, _made(context), Watcher(context)
     looks: list[Look] = []
@@ -87,15 +87,15 @@ def accept_checked(context: Context, clip: Clip, landmarks: Landmarks, offer: Of
     reasons = _first_reasons(looks, driving, subject, settings)
     left = [row for row, reason in enumerate(reasons) if reason is None]
     frames = [looks[row].frame for row in left]
-    poses = rows_of(offer.poses, frames)
+    poses = offer.poses.select(frames)
     if settings.register and left:
         usable = [check.usable_points(looks[row].keypoints, driving.matched[row]) for row in left]
         cameras = [offer.cameras[frame] for frame in frames]
         poses = register(clip, landmarks, poses, cameras, np.stack(usable))
-    for place, row in enumerate(left):
+    for row in left:
         frame = looks[row].frame
         mask = read_mask(folder / "masks", frame)
-        vertices = posed(clip, poses, place)[0]
+        vertices = posed_vertices(clip.body, clip.identity, poses.pose(frame))
         if not check.mask_fits(clip, vertices, offer.cameras[frame], mask, settings):
             reasons[row] = check.MASK
     kept = [row for row in left if reasons[row] is None]
@@ -107,7 +107,7 @@ def accept_checked(context: Context, clip: Clip, landmarks: Landmarks, offer: Of
     )
     return Accepted(
         folder=folder,
-        poses=rows_of(poses, frames),
+        poses=poses.select(frames),
         cameras={frame: offer.cameras[frame] for frame in frames},
         keypoints=np.stack([looks[row].keypoints for row in kept])
         if kept
@@ -128,14 +128,14 @@ class _Driving:
     identity: list[float | None] = dataclasses.field(default_factory=list)
 
 
-def _driving(clip: Clip, landmarks: Landmarks, offer: Offer, looks: list[Look]) -> _Driving:
+def _driving(clip: FittedClip, landmarks: Landmarks, offer: Offer, looks: list[Look]) -> _Driving:
     matched, cosines = [], []
     for look in looks:
-        row, camera = offer.poses.index(look.frame), offer.cameras[look.frame]
-        vertices, joints = posed(clip, offer.poses, row)
+        pose, camera = offer.poses.pose(look.frame), offer.cameras[look.frame]
+        vertices, joints = pose_frame(clip.body, clip.identity, pose)
         driven = driven_keypoints(clip, landmarks, joints, vertices, camera)
         place = check.mean_place(vertices)
-        cosines.append(check.head_facing(clip, offer.poses.rotation[row], camera, place))
+        cosines.append(check.head_facing(clip, pose, camera, place))
         matched.append(check.match(look.keypoints, driven, cosines[-1]))
     return _Driving(matched, cosines)
 
@@ -161,22 +161,6 @@ def _first_reasons(
         else:
             reasons.append(check.FLICKER if flickers[row] else None)
     return reasons
-
-
-@torch.no_grad()
-def posed(clip: Clip, poses: Poses, row: int) -> tuple[Tensor, Tensor]:
-    """Vertices [V, 3] and joints [55, 3] of one row of some poses."""
-    one = slice(row, row + 1)
-    vertices, joints = pose_body(
-        clip.body, clip.identity, poses.rotation[one], poses.expression[one], poses.transl[one]
-    )
-    return vertices[0], joints[0]
-
-
-def rows_of(poses: Poses, frames: list[int]) -> Poses:
-    """The poses of some frames."""
-    rows = [poses.index(frame) for frame in frames]
-    return Poses(tuple(frames), poses.rotation[rows], poses.expression[rows], poses.transl[rows])
 
 
 def _made(context: Context) -> Path:

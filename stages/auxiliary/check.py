@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.body import PARTS, joint_index, joint_orientations, part_labels, rasterize
+from pipeline.body import PARTS, Pose, joint_index, joint_orientations, part_labels, rasterize
 from pipeline.camera import Camera
+from pipeline.clip import FittedClip
 from pipeline.keypoints import BODY, FACE
 from pipeline.metrics.identity import identity_distance
 from stages.auxiliary.look import Look
 from stages.auxiliary.register import MIRRORED, POINTS, TRUSTED
 from stages.auxiliary.settings import AuxiliarySettings
-from stages.auxiliary.turn import Clip
 
 NOBODY = "nobody found"
 POSE = "keypoints far from the driving pose"
@@ -83,16 +83,16 @@ def usable_points(found: np.ndarray, matched: Matched) -> np.ndarray:
     return points[MIRRORED] if matched.mirrored else points
 
 
-def head_facing(clip: Clip, rotation: Tensor, camera: Camera, place: Tensor) -> float:
+def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> float:
     """The cosine between the head's front and the way to the camera.
 
     Args:
         clip: the body.
-        rotation: [55, 3].
+        pose: of the body.
         camera: the view.
         place: [3], where the body is.
     """
-    front = joint_orientations(rotation, clip.body.parents)[joint_index("head")][:, 2]
+    front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]
     view = camera.centre - place
     return float(front @ view / view.norm())
 
@@ -104,7 +104,7 @@ def wrong_way(look: Look, cosine: float) -> bool:
 
 
 def mask_fits(
-    clip: Clip, vertices: Tensor, camera: Camera, mask: np.ndarray, settings: AuxiliarySettings
+    clip: FittedClip, vertices: Tensor, camera: Camera, mask: np.ndarray, settings: AuxiliarySettings
 ) -> bool:
     """Whether a mask covers every limb that should be seen and not much beside the body."""
     raster = rasterize(camera, vertices, clip.body.faces)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from pipeline.body import rasterize
 from pipeline.body.mesh import Raster
+from pipeline.boxes import Box
 from pipeline.camera import Camera, project, to_camera
-from pipeline.records import spread
+from pipeline.clip import FittedClip
 from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import Clip
 
 SHOWN = 0.5  # share of the training frames that must have a vertex within their borders
 LOOKED_AT = 24  # training frames that are asked
@@ -56,12 +56,12 @@ class Cropped:
     news: float
 
 
-def find_framing(clip: Clip) -> Framing:
+def find_framing(clip: FittedClip) -> Framing:
     """Look at some training frames of the clip."""
-    frames = spread(clip.train, LOOKED_AT)
+    frames = clip.spread(LOOKED_AT)
     shown, densities = torch.zeros(len(clip.body.v_template)), []
     for frame in frames:
-        camera, vertices = clip.cameras[frame], clip.vertices(frame)
+        camera, vertices = clip.camera(frame), clip.vertices(frame)
         pixels, depth = project(camera, vertices), to_camera(camera, vertices)[:, 2]
         inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
         inside &= depth > 0
@@ -97,12 +97,11 @@ def crop(
     box = _box(camera, vertices[framing.shown > 0.5])
     if box is None:
         return None
-    left, top, right, bottom = box
-    view = camera.cropped(left, top, right - left, bottom - top)
+    view = camera.cropped(box.left, box.top, box.width, box.height)
     fine = surface.refine(vertices)
     raster = rasterize(view, fine, surface.faces)
     marks = raster.interpolate(surface.faces.numpy(), carried.numpy())
-    cut = mask[top:bottom, left:right].copy()
+    cut = mask[box.slices].copy()
     # What the clip never frames, a hand beside the hip of an upper body, is not the person's here; but nor
     # is it empty: Gaussians at the border would learn the background's random colours, which are grey.
     beyond = _outside(raster, marks[..., 1])
@@ -113,26 +112,24 @@ def crop(
     news = float((trust[person] > 127).mean()) if person.any() else 0.0
     scale = min(1.0, framing.density * float(to_camera(view, fine)[:, 2].median() / view.intrinsics[0, 0]))
     size = (max(SMALLEST, round(view.width * scale)), max(SMALLEST, round(view.height * scale)))
-    parts = [image[top:bottom, left:right], cut, trust]
+    parts = [image[box.slices], cut, trust]
     if size != (view.width, view.height):
         parts = [cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts]
     image, cut, trust = (np.ascontiguousarray(part) for part in parts)
     return Cropped(image, cut, trust, view.resized(*size), news)
 
 
-def _box(camera: Camera, points: Tensor) -> tuple[int, int, int, int] | None:
-    """Left, top, right, bottom of what the points cover in the picture, with a margin."""
+def _box(camera: Camera, points: Tensor) -> Box | None:
+    """The box of what the points cover in the picture, with a margin; None where that is too little."""
     if not len(points):
         return None
     pixels = project(camera, points)
     low, high = pixels.amin(0), pixels.amax(0)
     margin = MARGIN * float((high - low).max())
-    left, top = (max(0, int(value - margin)) for value in low.tolist())
-    limits = (camera.width, camera.height)
-    right, bottom = (
-        min(limit, int(value + margin) + 1) for value, limit in zip(high.tolist(), limits, strict=True)
-    )
-    return (left, top, right, bottom) if min(right - left, bottom - top) >= SMALLEST else None
+    left, top = (int(value - margin) for value in low.tolist())
+    right, bottom = (int(value + margin) + 1 for value in high.tolist())
+    box = Box(left, top, right, bottom).clipped(camera.width, camera.height)
+    return box if min(box.width, box.height) >= SMALLEST else None
 
 
 def _outside(raster: Raster, shown: np.ndarray) -> np.ndarray:

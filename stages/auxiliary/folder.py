@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,12 +22,14 @@ import torch
 
 from pipeline.body import Poses, read_poses, rest_joints
 from pipeline.camera import Camera, facing_camera
+from pipeline.clip import FittedClip
 from pipeline.errors import UserError
 from pipeline.keypoints import COUNT
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
 from pipeline.records import read_cameras, read_json
+from pipeline.spread import spread_from_start
 from stages.auxiliary.offer import Offer, Picture
-from stages.auxiliary.turn import ID_OFFSET, Clip, Turn
+from stages.auxiliary.turn import ID_OFFSET, Turn
 
 PICTURES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d+)")
@@ -34,7 +37,7 @@ _REMEDY = "see docs/auxiliary.md for the layouts that auxiliary.folder may have"
 _LARGEST = 1e6
 
 
-def read_folder(path: Path, clip: Clip, turn: Turn, body_file: Path) -> Offer:
+def read_folder(path: Path, clip: FittedClip, turn: Turn, body_file: Path) -> Offer:
     """What lies at ``path``, whichever layout it has.
 
     Raises:
@@ -66,7 +69,8 @@ def numbered(folder: Path) -> dict[int, Path]:
 
 
 def _ours(path: Path, frames: Path) -> Offer:
-    files, poses = numbered(frames), read_poses(path / "poses.parquet")
+    # Whatever their poses came from, the pictures were made from them.
+    files, poses = numbered(frames), dataclasses.replace(read_poses(path / "poses.parquet"), valid=None)
     cameras = read_cameras(path / "cameras.parquet")
     masks = numbered(path / "masks") if (path / "masks").is_dir() else {}
     usable = [frame for frame in poses.frames if frame in files and frame in cameras]
@@ -81,7 +85,7 @@ def _ours(path: Path, frames: Path) -> Offer:
     return Offer(poses, cameras, pictures())
 
 
-def _peers(path: Path, frames: Path, clip: Clip, body_file: Path) -> Offer:
+def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Offer:
     """The peers' ``_gen`` folder; frames are those with a picture, a pose and a camera, and on the list."""
     files = numbered(frames)
     files = {frame % ID_OFFSET: file for frame, file in files.items()}
@@ -166,10 +170,7 @@ def _fitted(images: list[np.ndarray], turn: Turn) -> Iterator[Picture]:
 
 def _places(count: int, turn: Turn) -> list[tuple[int, int]]:
     """Which picture shows which frame of the turn: all of it, or evenly spread."""
-    frames = turn.poses.frames
-    if count >= len(frames):
-        return [(place, frame) for place, frame in enumerate(frames)]
-    return [(place, frames[place * len(frames) // count]) for place in range(count)]
+    return list(enumerate(spread_from_start(turn.poses.frames, count)))
 
 
 def _cameras(turn: Turn) -> dict[int, Camera]:

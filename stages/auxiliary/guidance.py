@@ -19,13 +19,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import write_poses
+from pipeline.clip import FittedClip
 from pipeline.frames import frame_path, write_png
+from pipeline.json_files import write_json
 from pipeline.keypoints import empty_keypoints, write_keypoints
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import write_cameras, write_json
+from pipeline.records import write_cameras
 from stages.auxiliary.reference import Reference
 from stages.auxiliary.skeleton import draw_skeleton
-from stages.auxiliary.turn import Clip, Turn
+from stages.auxiliary.turn import Turn
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -34,7 +36,7 @@ FOLDER = "guidance"
 
 
 def write_guidance(
-    context: Context, clip: Clip, turn: Turn, keypoints: np.ndarray, reference: Reference
+    context: Context, clip: FittedClip, turn: Turn, keypoints: np.ndarray, reference: Reference
 ) -> None:
     """Write everything that the module's docstring lists.
 
@@ -73,7 +75,9 @@ def write_guidance(
     )
 
 
-def _write_records(folder: Path, clip: Clip, turn: Turn, keypoints: np.ndarray, body_file: Path) -> None:
+def _write_records(
+    folder: Path, clip: FittedClip, turn: Turn, keypoints: np.ndarray, body_file: Path
+) -> None:
     cameras = dict.fromkeys(turn.poses.frames, turn.camera)
     write_poses(folder / "poses.parquet", turn.poses)
     write_cameras(folder / "cameras.parquet", cameras)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from pipeline.boxes import Box
+from pipeline.clip import FittedClip
 from pipeline.detection.estimator import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels
-from pipeline.frames import read_frame
 from pipeline.keypoints import FACE
 from pipeline.metrics.identity import FaceReader, typical
 from stages.auxiliary.offer import Picture
-from stages.auxiliary.turn import Clip
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -87,19 +87,19 @@ class Watcher:
         if float((high - low).max()) < SMALLEST_FACE:
             return None
         room = FACE_ROOM * float((high - low).max())
-        box = tuple(int(value) for value in (*(low - room), *(high + room)))
-        found = self._faces.read(image, box)  # type: ignore[arg-type]
+        box = Box(*(int(value) for value in (*(low - room), *(high + room))))
+        found = self._faces.read(image, box)
         return found.embedding if found else None
 
-    def subject(self, clip: Clip) -> np.ndarray | None:
+    def subject(self, clip: FittedClip) -> np.ndarray | None:
         """The clip's own face; None where the finder sees none in it that is large enough."""
-        scored = [(clip.keypoints.whole_body[clip.keypoints.index(f), FACE, 2].mean(), f) for f in clip.train]
+        points, index = clip.keypoints.whole_body, clip.keypoints.index
+        scored = [(points[index(f), FACE, 2].mean(), f) for f in clip.split.train]
         best = [frame for score, frame in sorted(scored, key=lambda one: (-one[0], one[1])) if score > 0.3]
         best = best[:: max(1, len(best) // (4 * FACES))][:FACES]
         found = []
         for frame in best:
-            points = clip.keypoints.whole_body[clip.keypoints.index(frame)]
-            found.append(self.embedding(read_frame(clip.folder / "frames", frame), points))
+            found.append(self.embedding(clip.frame(frame), points[index(frame)]))
         known = [one for one in found if one is not None]
         return typical(known) if known else None
 

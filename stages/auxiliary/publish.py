@@ -9,15 +9,20 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import write_poses
+from pipeline.body import posed_vertices, write_poses
 from pipeline.camera import Camera
+from pipeline.clip import FittedClip
+from pipeline.composite import composite
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.json_files import write_json
 from pipeline.keypoints import empty_keypoints, write_keypoints
-from pipeline.records import write_cameras, write_json
-from stages.auxiliary.accept import Accepted, posed, rows_of
+from pipeline.pictures import side_by_side
+from pipeline.records import write_cameras
+from pipeline.spread import spread_from_start
+from stages.auxiliary.accept import Accepted
 from stages.auxiliary.crop import Framing, crop
 from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import ID_OFFSET, Clip
+from stages.auxiliary.turn import ID_OFFSET
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -30,7 +35,7 @@ _SHEET, _TILE = 8, 256  # frames of the contact sheet, and pixels of their heigh
 
 def publish(
     context: Context,
-    clip: Clip,
+    clip: FittedClip,
     accepted: Accepted,
     framing: Framing,
     surface: FineSurface,
@@ -56,10 +61,10 @@ def publish(
     cameras: dict[int, Camera] = {}
     refused, sheet = dict(accepted.refused), []
     with context.progress(len(accepted.poses), "crops") as progress:
-        for row, frame in enumerate(accepted.poses.frames):
+        for frame in accepted.poses.frames:
             image = read_frame(accepted.folder / "frames", frame)
             mask = read_mask(accepted.folder / "masks", frame)
-            vertices = posed(clip, accepted.poses, row)[0]
+            vertices = posed_vertices(clip.body, clip.identity, accepted.poses.pose(frame))
             made = crop(image, mask, accepted.cameras[frame], vertices, surface, carried, framing)
             reason = OUT_OF_FRAME if made is None else NOTHING_NEW if made.news < LEAST_NEWS else None
             if reason == NOTHING_NEW and not settings.unseen_only:
@@ -76,8 +81,7 @@ def publish(
             progress.advance()
     write_records(context, accepted, cameras, refused)
     if sheet:
-        chosen = [sheet[k * len(sheet) // min(_SHEET, len(sheet))] for k in range(min(_SHEET, len(sheet)))]
-        write_png(output / "preview.png", side_by_side(chosen))
+        write_png(output / "preview.png", side_by_side(spread_from_start(sheet, _SHEET)))
 
 
 def write_records(
@@ -86,12 +90,12 @@ def write_records(
     """Write cameras, poses, keypoints and ``auxiliary.json`` of the frames that have a camera."""
     output, frames = context.output, sorted(cameras)
     numbers = tuple(ID_OFFSET + frame for frame in frames)
-    poses = dataclasses.replace(rows_of(accepted.poses, frames), frames=numbers)
+    poses = dataclasses.replace(accepted.poses.select(frames), frames=numbers)
     write_poses(output / "poses.parquet", poses)
     write_cameras(output / "cameras.parquet", {ID_OFFSET + frame: cameras[frame] for frame in frames})
     table = empty_keypoints(np.array(numbers, np.int64))
     for row, frame in enumerate(frames):
-        points = accepted.keypoints[accepted.poses.frames.index(frame)]
+        points = accepted.keypoints[accepted.poses.index(frame)]
         table.whole_body[row] = moved(points, accepted.cameras[frame], cameras[frame])
     write_keypoints(output / "keypoints.parquet", table)
     distances = [value for frame in frames if (value := accepted.identity.get(frame)) is not None]
@@ -126,14 +130,8 @@ def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
 
 def tile(image: np.ndarray, mask: np.ndarray, trust: np.ndarray) -> np.ndarray:
     """A frame for the contact sheet: the person on grey, and below it what is learnt from it."""
-    alpha = mask[..., None] / np.float32(255)
-    person = image * alpha + 208 * (1 - alpha)
+    person = composite(image, mask / np.float32(255), 208.0)
     learnt = person * (0.25 + 0.75 * trust[..., None] / np.float32(255))
     both = np.concatenate([person, learnt]).astype(np.uint8)
     scale = 2 * _TILE / both.shape[0]
     return cv2.resize(both, (max(1, round(both.shape[1] * scale)), 2 * _TILE), interpolation=cv2.INTER_AREA)
-
-
-def side_by_side(tiles: list[np.ndarray]) -> np.ndarray:
-    """Tiles of equal height in a row."""
-    return np.concatenate(tiles, axis=1)

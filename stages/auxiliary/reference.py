@@ -14,15 +14,14 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import Landmarks, joint_index, joint_orientations, locate, pose_body
+from pipeline.body import Landmarks, joint_index, joint_orientations, locate, pose_frame
 from pipeline.camera import Camera, project
-from pipeline.frames import read_frame, read_mask
+from pipeline.clip import FittedClip
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.records import spread
 from stages.auxiliary.crop import Framing
 from stages.auxiliary.skeleton import driven_keypoints
 from stages.auxiliary.texture import FineSurface, paint
-from stages.auxiliary.turn import Clip, Turn
+from stages.auxiliary.turn import Turn
 
 LOOKED_AT = 60  # frames that are scored
 WEIGHTS = {"facing": 2.0, "sharpness": 1.0, "face": 1.0, "hands": 0.5, "mask": 1.0}
@@ -55,11 +54,11 @@ class Score:
         return sum(weight * getattr(self, name) for name, weight in WEIGHTS.items()) / sum(WEIGHTS.values())
 
 
-def score_frames(clip: Clip) -> list[Score]:
+def score_frames(clip: FittedClip) -> list[Score]:
     """Score some training frames, best first."""
     looks = []
-    for frame in spread(clip.train, LOOKED_AT):
-        image, mask = read_frame(clip.folder / "frames", frame), read_mask(clip.folder / "masks", frame)
+    for frame in clip.spread(LOOKED_AT):
+        image, mask = clip.frame(frame), clip.mask(frame)
         points = clip.keypoints.whole_body[clip.keypoints.index(frame)]
         looks.append((frame, facing(clip, frame), sharpness(image, mask), points, surety(mask)))
     sharpest = max(max(look[2] for look in looks), 1e-9)
@@ -77,12 +76,10 @@ def score_frames(clip: Clip) -> list[Score]:
     return sorted(scores, key=lambda score: (-score.total, score.frame))
 
 
-def facing(clip: Clip, frame: int) -> float:
+def facing(clip: FittedClip, frame: int) -> float:
     """How far the head looks at the camera, 0 (sideways or away) to 1."""
-    row = clip.poses.index(frame)
-    front = joint_orientations(clip.poses.rotation[row], clip.body.parents)[joint_index("head")][:, 2]
-    camera = clip.cameras[frame]
-    view = camera.centre - clip.vertices(frame).mean(0)
+    front = joint_orientations(clip.pose(frame).rotation, clip.body.parents)[joint_index("head")][:, 2]
+    view = clip.camera(frame).centre - clip.vertices(frame).mean(0)
     return max(0.0, float(front @ view / view.norm()))
 
 
@@ -117,7 +114,7 @@ class Reference:
 
 
 def make_reference(
-    clip: Clip,
+    clip: FittedClip,
     turn: Turn,
     landmarks: Landmarks,
     framing: Framing,
@@ -126,17 +123,11 @@ def make_reference(
 ) -> Reference:
     """The best frame, its person where the turn's stands, made whole."""
     score = score_frames(clip)[0]
-    frame, row = score.frame, clip.poses.index(score.frame)
-    one = slice(row, row + 1)
-    poses = clip.poses
-    with torch.no_grad():
-        posed = pose_body(
-            clip.body, clip.identity, poses.rotation[one], poses.expression[one], poses.transl[one]
-        )
-    vertices, joints = posed[0][0], posed[1][0]
+    frame = score.frame
+    vertices, joints = pose_frame(clip.body, clip.identity, clip.pose(frame))
     camera = moved_camera(clip, turn, landmarks, frame, joints, vertices)
     width, height = camera.width, camera.height
-    image, mask = read_frame(clip.folder / "frames", frame), read_mask(clip.folder / "masks", frame)
+    image, mask = clip.frame(frame), clip.mask(frame)
     change = _change(clip.cameras[frame], camera)
     warped = cv2.warpAffine(
         image, change, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
@@ -153,18 +144,13 @@ def make_reference(
     return Reference(np.clip(np.round(picture), 0, 255).astype(np.uint8), keypoints, score, not whole)
 
 
-def moved_camera(clip: Clip, turn: Turn, landmarks: Landmarks, frame, joints, vertices) -> Camera:
+def moved_camera(clip: FittedClip, turn: Turn, landmarks: Landmarks, frame, joints, vertices) -> Camera:
     """The clip's camera with its picture moved and scaled onto the turn's first skeleton."""
     camera = clip.cameras[frame]
-    one = slice(0, 1)
-    poses = turn.poses
-    with torch.no_grad():
-        there = pose_body(
-            clip.body, clip.identity, poses.rotation[one], poses.expression[one], poses.transl[one]
-        )
+    there = pose_frame(clip.body, clip.identity, turn.poses.pose(0))
     anchors = landmarks.whole_body[torch.tensor(_ANCHORS)]
     source = project(camera, locate(anchors, joints, vertices)).numpy()
-    target = project(turn.camera, locate(anchors, there[1][0], there[0][0])).numpy()
+    target = project(turn.camera, locate(anchors, there[1], there[0])).numpy()
     centred = source - source.mean(0)
     # Heights alone: a person who stands half turned is narrow, not small.
     scale = float(

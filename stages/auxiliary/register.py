@@ -17,15 +17,15 @@ from pipeline.body import (
     Landmarks,
     Poses,
     joint_transforms,
+    linear_blend_skinning,
     locate,
     posed_joints,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.body.joints import BODY_POSE
 from pipeline.camera import Camera, project
-from stages.auxiliary.turn import Clip
+from pipeline.clip import FittedClip
 
 POINTS = slice(0, 23)  # body and feet
 STEPS, RATE = 120, 0.01
@@ -38,7 +38,7 @@ MIRRORED = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11, 14, 13, 16, 15, 2
 
 
 def register(
-    clip: Clip,
+    clip: FittedClip,
     landmarks: Landmarks,
     poses: Poses,
     cameras: list[Camera],
@@ -80,7 +80,7 @@ def register(
     for _ in range(STEPS):
         rotation, transl = posed()
         transforms = joint_transforms(rotation, joints, clip.body.parents)
-        vertices = skin(transforms, weights, rest) + transl[:, None]
+        vertices = linear_blend_skinning(transforms, weights, rest) + transl[:, None]
         places = locate(
             compact, posed_joints(rotation, joints, clip.body.parents) + transl[:, None], vertices
         )

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.body import load_landmarks
+from pipeline.body import load_landmarks, posed_vertices
+from pipeline.clip import FittedClip
 from pipeline.errors import UserError
 from pipeline.plan import read_plan
-from pipeline.records import spread
 from stages.auxiliary import texture
 from stages.auxiliary.accept import accept_checked, accept_exact
 from stages.auxiliary.crop import find_framing
@@ -22,7 +22,7 @@ from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.publish import publish
 from stages.auxiliary.reference import make_reference
 from stages.auxiliary.skeleton import turn_keypoints
-from stages.auxiliary.turn import Clip, Turn, make_turn, posed_vertices, read_clip
+from stages.auxiliary.turn import Turn, make_turn, read_numbered_clip
 
 if TYPE_CHECKING:
     from pipeline.stage import Context
@@ -43,10 +43,12 @@ def run(context: Context) -> None:
         context.log("no auxiliary views are called for")
         return
     shutil.rmtree(context.work / "made", ignore_errors=True)
-    clip = read_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
+    clip = read_numbered_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
     landmarks, settings = load_landmarks(clip.body, context.body), context.settings
     turn, surface = make_turn(clip, settings), texture.fine_surface(clip.body, settings.texture_levels)
-    seen = texture.gather(clip, surface, spread(clip.train, settings.texture_frames), context)
+    frames = clip.spread(settings.texture_frames)
+    with context.progress(len(frames), "texture") as progress:
+        seen = texture.gather(surface, clip, frames, progress.advance)
     colors, framing = texture.complete(surface, seen, settings.texture_light), find_framing(clip)
     context.log(f"the clip shows {seen.known.mean():.0%} of the surface")
     if generator != "texture" or settings.texture_guidance:
@@ -79,19 +81,19 @@ def chosen_generator(context: Context) -> str:
     return "texture" if called_for else "off"
 
 
-def painted(clip: Clip, turn: Turn, surface: texture.FineSurface, colors: np.ndarray) -> Offer:
+def painted(clip: FittedClip, turn: Turn, surface: texture.FineSurface, colors: np.ndarray) -> Offer:
     """The ``texture`` generator: the textured body through the turn."""
 
     def pictures() -> Iterator[Picture]:
-        for row, frame in enumerate(turn.poses.frames):
-            vertices = posed_vertices(clip.body, clip.identity, turn.poses, row)
+        for frame in turn.poses.frames:
+            vertices = posed_vertices(clip.body, clip.identity, turn.poses.pose(frame))
             image, mask, _ = texture.paint(turn.camera, surface, vertices, colors)
             yield Picture(frame, image, mask)
 
     return Offer(turn.poses, dict.fromkeys(turn.poses.frames, turn.camera), pictures(), exact=True)
 
 
-def offered(context: Context, generator: str, clip: Clip, turn: Turn) -> Offer:
+def offered(context: Context, generator: str, clip: FittedClip, turn: Turn) -> Offer:
     """The frames of ``folder`` or ``mimicmotion``."""
     settings = context.settings
     if generator == "folder":

@@ -2,85 +2,84 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import Annotated, Literal
 
-GENERATORS = ("auto", "off", "guidance", "texture", "mimicmotion", "folder")
-MOTIONS = ("relaxed", "clip")
-AMOUNTS = ("keypoint_distance", "mask_missing", "mask_outside", "identity_distance", "flicker", "fps")
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from pipeline.config.choices import Device
+from pipeline.settings import SETTINGS, Angle, Count, FrameRate, Positive, Seed, setting
+
+TurnFrames = Annotated[int, Field(ge=4, le=100_000)]
+Scale = Annotated[float, Field(ge=0, le=1000)]
+TurnSide = Annotated[int, Field(ge=64, le=8192)]
+Levels = Annotated[int, Field(ge=0, le=2)]
+Steps = Annotated[int, Field(ge=1, le=10_000)]
+
 MEASURED = ("mimicmotion", "folder")  # generators whose frames have to be looked at
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class AuxiliarySettings:
     """Settings of the auxiliary stage."""
 
-    # auto: texture where the plan asks for auxiliary views, else off; it costs a minute and some of the seen
-    # side's quality, so that the quick preset leaves it. guidance: only what a generator elsewhere needs.
-    generator: str = "off"
-    folder: str = ""  # of folder: frames that somebody made, or a video file
-    weights: str = ""  # of mimicmotion: the folder with the model's weights
+    # auto costs a minute and some of the seen side's quality, so that the quick preset leaves it.
+    generator: Literal["auto", "off", "guidance", "texture", "mimicmotion", "folder"] = setting(
+        "off", "auto: texture where the plan asks for views; guidance: only what a generator elsewhere needs"
+    )
+    folder: str = setting("", "of folder: frames that somebody made, or a video file")
+    weights: str = setting("", "of mimicmotion: the folder with the model's weights")
 
     # The turn
-    frames: int = 48  # of the full turn; the paper has about 500
-    motion: str = "relaxed"  # the body's pose while it turns: relaxed, or clip: as it moves in the clip
-    arm_angle: float = 1.05  # radians below the T pose, of a relaxed arm
-    width: int = 576  # pixels of the guidance, what MimicMotion was trained on
-    height: int = 1024
-    fps: float = 15.0  # of the guidance's video
+    frames: TurnFrames = setting(48, "of the full turn; the paper has about 500")
+    motion: Literal["relaxed", "clip"] = setting(
+        "relaxed", "the body's pose while it turns; clip: as it moves in the clip"
+    )
+    arm_angle: Angle = setting(1.05, "radians below the T pose, of a relaxed arm")
+    width: TurnSide = setting(576, "pixels of the guidance, what MimicMotion was trained on")
+    height: TurnSide = setting(1024, "pixels of the guidance")
+    fps: FrameRate = setting(15.0, "of the guidance's video")
 
     # texture
-    texture_frames: int = 24  # of the clip, whose colours are projected
-    texture_levels: int = 2  # of subdivision of the mesh that carries the texture
-    texture_light: bool = True  # shade the unseen side as the seen one says that light falls
-    texture_guidance: bool = True  # write the guidance too
+    texture_frames: Count = setting(24, "of the clip, whose colours are projected")
+    texture_levels: Levels = setting(2, "of subdivision of the mesh that carries the texture")
+    texture_light: bool = setting(True, "shade the unseen side as the seen one says that light falls")
+    texture_guidance: bool = setting(True, "write the guidance too")
 
     # mimicmotion
-    seed: int = 42
-    steps: int = 25
-    guidance_scale: float = 2.0
-    tile: int = 72  # frames that are denoised together
-    overlap: int = 6  # frames that neighbouring tiles share
-    device: str = "auto"
-    half_precision: bool = True  # on a GPU
+    seed: Seed = setting(42, "of the noise that is denoised")
+    steps: Steps = setting(25, "of denoising")
+    guidance_scale: Scale = setting(2.0, "of classifier-free guidance")
+    tile: Steps = setting(72, "frames that are denoised together")
+    overlap: Steps = setting(6, "frames that neighbouring tiles share")
+    device: Device = setting("auto", "where it computes")
+    half_precision: bool = setting(True, "on a GPU")
 
     # What is thrown out; distances in parts of the driving pose's height
-    keypoint_distance: float = 0.06  # mean distance of trusted body points from the driving pose's
-    mask_missing: float = 0.4  # share of a limb that the mask may lack
-    mask_outside: float = 0.5  # of the body's area, how much mask may lie beside the body
-    identity_distance: float = (
-        0.55  # of a face from the subject's own; one person's differ by 0.5, two people's by 0.66
+    keypoint_distance: Positive = setting(
+        0.06, "mean distance of trusted body points from the driving pose's"
     )
-    flicker: float = 3.0  # times the usual change from frame to frame
-    check: bool = True  # whether frames of mimicmotion and folder are checked at all
-    register: bool = True  # fit the poses of the kept frames, starting from the driving pose
+    mask_missing: Positive = setting(0.4, "share of a limb that the mask may lack")
+    mask_outside: Positive = setting(0.5, "of the body's area, how much mask may lie beside the body")
+    # One person's faces differ by 0.5, two people's by 0.66.
+    identity_distance: Positive = setting(0.55, "of a face from the subject's own")
+    flicker: Positive = setting(3.0, "times the usual change from frame to frame")
+    check: bool = setting(True, "whether frames of mimicmotion and folder are checked at all")
+    register: bool = setting(True, "fit the poses of the kept frames, starting from the driving pose")
 
-    unseen_only: bool = True  # learn from a generated picture only where the clip shows nothing
+    unseen_only: bool = setting(True, "learn from a generated picture only where the clip shows nothing")
 
-    def __post_init__(self) -> None:
-        """Refuses values that cannot work."""
-        if self.generator not in GENERATORS:
-            raise ValueError(f"auxiliary.generator must be one of {', '.join(GENERATORS)}")
-        if self.motion not in MOTIONS:
-            raise ValueError(f"auxiliary.motion must be one of {', '.join(MOTIONS)}")
+    @model_validator(mode="after")
+    def _fit_together(self) -> AuxiliarySettings:
         if self.generator == "folder" and not self.folder:
             raise ValueError("auxiliary.generator=folder needs auxiliary.folder=FOLDER_OR_VIDEO")
         if self.generator == "mimicmotion" and not self.weights:
             raise ValueError("auxiliary.generator=mimicmotion needs auxiliary.weights=FOLDER")
-        if self.texture_levels not in (0, 1, 2):
-            raise ValueError("auxiliary.texture_levels must be 0, 1 or 2")
-        if not 1 <= self.overlap < self.tile - 1:
-            raise ValueError("auxiliary.overlap must be at least 1 and less than auxiliary.tile - 1")
-        self._require(("frames",), 4)
-        self._require(("width", "height"), 64)
-        self._require(("texture_frames", "steps"), 1)
-        for name in AMOUNTS:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"auxiliary.{name} must be more than 0, not {getattr(self, name)}")
-
-    def _require(self, names: tuple[str, ...], least: int) -> None:
-        for name in names:
-            if getattr(self, name) < least:
-                raise ValueError(f"auxiliary.{name} must be at least {least}, not {getattr(self, name)}")
+        if self.overlap >= self.tile - 1:
+            raise ValueError(
+                f"auxiliary.overlap must be less than auxiliary.tile - 1, {self.tile - 1}, not {self.overlap}"
+            )
+        return self
 
     @property
     def assets(self) -> tuple[str, ...]:

@@ -11,13 +11,13 @@ import colorsys
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
-from pipeline.body import Landmarks, locate, pose_body, rasterize
+from pipeline.body import Landmarks, locate, pose_frame, rasterize
 from pipeline.camera import Camera, project, to_camera
+from pipeline.clip import FittedClip
 from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from stages.auxiliary.turn import Clip, Turn
+from stages.auxiliary.turn import Turn
 
 LEAST = 0.3  # the score under which a point is not drawn
 DIMMED = 0.6  # of the body layer's limbs
@@ -112,7 +112,7 @@ def _place(x: float, y: float) -> tuple[int, int]:
 
 
 def driven_keypoints(
-    clip: Clip, landmarks: Landmarks, joints: Tensor, vertices: Tensor, camera: Camera
+    clip: FittedClip, landmarks: Landmarks, joints: Tensor, vertices: Tensor, camera: Camera
 ) -> np.ndarray:
     """The 133 points of a posed body as a detector would give them: [133, 3] float32.
 
@@ -139,18 +139,10 @@ def driven_keypoints(
     return np.concatenate([pixels, (scores * inside)[:, None]], axis=1).astype(np.float32)
 
 
-def turn_keypoints(clip: Clip, turn: Turn, landmarks: Landmarks) -> np.ndarray:
+def turn_keypoints(clip: FittedClip, turn: Turn, landmarks: Landmarks) -> np.ndarray:
     """The driving skeletons of a whole turn: [T, 133, 3] float32."""
     found = []
-    for row in range(len(turn.poses)):
-        one = slice(row, row + 1)
-        with torch.no_grad():
-            vertices, joints = pose_body(
-                clip.body,
-                clip.identity,
-                turn.poses.rotation[one],
-                turn.poses.expression[one],
-                turn.poses.transl[one],
-            )
-        found.append(driven_keypoints(clip, landmarks, joints[0], vertices[0], turn.camera))
+    for frame in turn.poses.frames:
+        vertices, joints = pose_frame(clip.body, clip.identity, turn.poses.pose(frame))
+        found.append(driven_keypoints(clip, landmarks, joints, vertices, turn.camera))
     return np.stack(found)

@@ -11,21 +11,11 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.body import (
-    JOINT_NAMES,
-    BodyModel,
-    Identity,
-    Poses,
-    load_body,
-    pose_body,
-    read_identity,
-    read_poses,
-    rest_joints,
-)
+from pipeline.body import JOINT_NAMES, Poses, posed_vertices, rest_joints
 from pipeline.camera import Camera, facing_camera
+from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.errors import UserError
-from pipeline.keypoints import Keypoints, read_keypoints
-from pipeline.records import read_cameras, read_split
+from pipeline.spread import spread_end_to_end
 from stages.auxiliary.settings import AuxiliarySettings
 
 ID_OFFSET = 100_000
@@ -37,53 +27,13 @@ _FILL = 0.9  # of the picture, by the body at its widest
 _CHUNK = 32  # frames that are posed at once, which bounds the memory
 
 
-@dataclasses.dataclass(frozen=True)
-class Clip:
-    """What ingest and fit published, as far as this stage reads it.
-
-    Attributes:
-        folder: what ingest published.
-        body, identity, poses: the fitted person.
-        cameras: frame number -> camera.
-        keypoints: what was detected.
-        train: the frames to learn from.
-    """
-
-    folder: Path
-    body: BodyModel
-    identity: Identity
-    poses: Poses
-    cameras: dict[int, Camera]
-    keypoints: Keypoints
-    train: tuple[int, ...]
-
-    def vertices(self, frame: int) -> Tensor:
-        """The fitted surface in one frame: [V, 3], metres, in the world."""
-        row = self.poses.index(frame)
-        return posed_vertices(self.body, self.identity, self.poses, row)
-
-
-def read_clip(ingest: Path, fit: Path, body_file: Path) -> Clip:
-    """Read what the stage needs.
+def read_numbered_clip(ingest: Path, fit: Path, body_file: Path) -> FittedClip:
+    """The clip, whose frame numbers leave those of generated frames free.
 
     Raises:
-        UserError: a file is missing or damaged, or frame numbers reach those of generated frames.
+        UserError: as of ``read_fitted_clip``, or frame numbers reach those of generated frames.
     """
-    body = load_body(body_file)
-    clip = Clip(
-        folder=ingest,
-        body=body,
-        identity=read_identity(fit / "identity.safetensors", body),
-        poses=read_poses(fit / "poses.parquet"),
-        cameras=read_cameras(ingest / "cameras.parquet"),
-        keypoints=read_keypoints(ingest / "keypoints.parquet"),
-        train=read_split(ingest / "split.json").train,
-    )
-    missing = sorted(set(clip.train) - set(clip.poses.frames))
-    if missing:
-        raise UserError(
-            f"{fit / 'poses.parquet'} has no pose for frame {missing[0]}: run the fit stage again"
-        )
+    clip = read_fitted_clip(ingest, fit, body_file)
     if clip.poses.frames[-1] >= ID_OFFSET:
         raise UserError(f"{ingest}: frame {clip.poses.frames[-1]} has the number of a generated frame")
     return clip
@@ -104,7 +54,7 @@ class Turn:
     azimuth: np.ndarray
 
 
-def make_turn(clip: Clip, settings: AuxiliarySettings) -> Turn:
+def make_turn(clip: FittedClip, settings: AuxiliarySettings) -> Turn:
     """A full turn of the fitted person, upright, at a distance at which nothing is cut off."""
     count = settings.frames
     azimuth = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
@@ -121,13 +71,13 @@ def make_turn(clip: Clip, settings: AuxiliarySettings) -> Turn:
     return Turn(poses, camera, azimuth.numpy())
 
 
-def _postures(clip: Clip, settings: AuxiliarySettings) -> Tensor:
+def _postures(clip: FittedClip, settings: AuxiliarySettings) -> Tensor:
     """The rotations of every joint before the turn, [T, 55, 3]; the root's own faces the camera."""
     count = settings.frames
     if settings.motion == "clip":
-        trained = sorted(clip.train)
-        rows = [clip.poses.index(trained[k * len(trained) // count]) for k in range(count)]
-        rotation = clip.poses.rotation[rows].clone()
+        trained = sorted(clip.split.train)
+        frames = [trained[k * len(trained) // count] for k in range(count)]
+        rotation = clip.poses.select(frames).rotation
         rotation[:, 0] = _without_heading(rotation[:, 0])
         return rotation
     rotation = torch.zeros(count, len(JOINT_NAMES), 3)
@@ -144,12 +94,12 @@ def _without_heading(orient: Tensor) -> Tensor:
     return roma.rotvec_composition([heading, orient])
 
 
-def _placed(clip: Clip, poses: Poses, settings: AuxiliarySettings) -> tuple[Camera, Tensor]:
+def _placed(clip: FittedClip, poses: Poses, settings: AuxiliarySettings) -> tuple[Camera, Tensor]:
     """The camera, and where the pelvis has to be before it: [3]."""
     width, height = settings.width, settings.height
     focal = height / 2 / math.tan(_FIELD / 2)
-    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).round().astype(int))
-    vertices = torch.cat([posed_vertices(clip.body, clip.identity, poses, int(row)) for row in rows])
+    some = [poses.pose(frame) for frame in spread_end_to_end(poses.frames, 24)]
+    vertices = torch.cat([posed_vertices(clip.body, clip.identity, pose) for pose in some])
     low, high = vertices.amin(0), vertices.amax(0)
     middle = torch.stack([torch.zeros(()), (low[1] + high[1]) / 2, torch.zeros(())])
     away = (vertices - middle).abs()
@@ -158,10 +108,3 @@ def _placed(clip: Clip, poses: Poses, settings: AuxiliarySettings) -> tuple[Came
     up = (away[:, 1] * focal / (_FILL * height / 2) + vertices[:, 2]).max()
     place = torch.tensor([0.0, 0.0, -float(torch.maximum(across, up))]) - middle
     return facing_camera(width, height, focal), place
-
-
-@torch.no_grad()
-def posed_vertices(body: BodyModel, identity: Identity, poses: Poses, row: int) -> Tensor:
-    """The surface in one row of some poses: [V, 3], metres, in the world."""
-    one = slice(row, row + 1)
-    return pose_body(body, identity, poses.rotation[one], poses.expression[one], poses.transl[one])[0][0]

@@ -1,4 +1,4 @@
-"""From offsets at the face's landmarks to offsets of the face's vertices, smoothly."""
+"""Smooth offsets of the face's vertices from offsets at its landmarks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOUTH = 0.03  # metres that lie between two touching points if one follows the 
 
 
 def spread_matrix(body: BodyModel, controls: PointSet) -> Tensor:
-    """How far each vertex follows the offset of each control.
+    """The share of each control's offset that each vertex follows.
 
     A vertex takes the Gaussian-weighted mean of the controls around it, and less of it the farther
     the nearest control is, so that the face's rim has no step; 4 cm outside the controls nothing is
@@ -49,13 +49,13 @@ def spread_matrix(body: BodyModel, controls: PointSet) -> Tensor:
 
 
 def on_skin(body: BodyModel, points: PointSet) -> Tensor:
-    """Which points may carry an offset: on the surface, and not on an eyeball. [N] bool."""
+    """The points that may carry an offset, on the surface and not on an eyeball: [N] bool."""
     eyes = body.skinning_weights[:, [LEFT_EYE, RIGHT_EYE]].sum(1)[points.vertices]
     return (points.joint < 0) & ((eyes * points.barycentrics).sum(1) < 0.5)
 
 
 def mirror_matrix(places: Tensor) -> Tensor:
-    """For each point, the one nearest to its mirror image in X: [N, 3] -> [N, N], one 1 a row."""
+    """A matrix that picks each point's mirror partner in X, the nearest to its image: [N, 3] -> [N, N]."""
     if len(places) == 0:
         return places.new_zeros(0, 0)
     image = places * places.new_tensor([-1.0, 1.0, 1.0])

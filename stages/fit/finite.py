@@ -1,4 +1,4 @@
-"""Where in a fit a number is not finite: the terms or parameters, the step and the frames."""
+"""Checks of a fit's numbers: what is not finite is named by term or parameter, step and frames."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def finite_loss(
 
 
 def require_finite_gradient(objective: Objective, gradient: Mapping[str, Tensor], step: int) -> None:
-    """Refuses a slope that is not finite, which Adam would carry into every later step.
+    """Refuse a gradient that is not finite, which Adam would carry into every later step.
 
     Raises:
         NotFiniteError: names the parameters and the frames.

@@ -1,4 +1,4 @@
-"""Where the optimisation starts: arms down, the torso turned as the 3D landmarks say, in its place.
+"""The start of the optimisation: arms down, the torso turned as the 3D landmarks say, in its place.
 
 A T pose is far from every clip. The torso's turn comes from the estimator's 3D landmarks where the
 torso is seen; the place comes from a weak-perspective fit of the landmarks to their pixels.

@@ -1,4 +1,4 @@
-"""The registration objective, Eq. 1: what each term weighs, and their sum.
+"""The registration objective, Eq. 1: its terms' weights, and their sum.
 
 Every term is summed over points and averaged over frames, so that weights do not depend on a clip's
 length. Errors are measured in pixels of a picture whose long side is 512, so that they do not depend on
@@ -18,9 +18,9 @@ from pipeline.body.joints import BODY_POSE, JAW
 from stages.fit import terms
 from stages.fit.face import FaceTarget, sface
 from stages.fit.face_offset import mirror_matrix
+from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import Directions, Observations
 from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
-from stages.fit.ranges import joint_ranges
 from stages.fit.settings import FitSettings
 from stages.fit.views import Views
 from stages.fit.windows import Window, windows
@@ -44,7 +44,7 @@ _STIFFNESS = {
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """What parameters say about a clip.
+    """A clip as parameters predict it.
 
     Attributes:
         matrices: [T, 55, 3, 3], with the joints that nothing was seen of at their initial rotation.
@@ -61,7 +61,7 @@ class Prediction:
 
 @dataclasses.dataclass(frozen=True)
 class Face:
-    """What L_sface compares: the face that was fitted first, and its points on the body."""
+    """The two sides of L_sface: the face that was fitted first, and its points on the body."""
 
     target: FaceTarget
     model: LandmarkModel
@@ -99,8 +99,8 @@ class Objective:
         self.scale = (LONG_SIDE / views.size.amax(1))[:, None, None]
         self.times = (observations.frames - observations.frames[0]).float()
         names = body.joint_names[:JAW]
-        self.ranges = joint_ranges()
-        self.looked_at = torch.unique(torch.cat([self.ranges.joint, torch.arange(JAW, HANDS.start)]))
+        self.joint_limits = joint_limits()
+        self.looked_at = torch.unique(torch.cat([self.joint_limits.joint, torch.arange(JAW, HANDS.start)]))
         self.stiffness = torch.tensor([_STIFFNESS.get(name, 0.3) for name in names])
         kinds = (observations.limbs, observations.hand_bones)
         self.bones = [(bones, *_picks(bones, len(observations.group))) for bones in kinds]
@@ -163,7 +163,7 @@ class Objective:
         return torch.where(self.observations.mask, error, torch.full_like(error, torch.nan))
 
     def _mean(self, of_frames: Tensor, window: Window) -> Tensor:
-        """What a window's own frames add to the mean over the clip: [W] -> a number."""
+        """The part of a window's own frames in the mean over the clip: [W] -> a number."""
         return of_frames[window.own].sum() / len(self.times)
 
     def _keypoints(self, predicted: Prediction, robust: bool, window: Window) -> Tensor:
@@ -202,8 +202,8 @@ class Objective:
         expression = terms.initial_loss(parameters.expression, self.initial.expression[window.posed])
         vectors = self._vectors(matrices)
         eyes, jaw = vectors[:, EYES].square(), vectors[:, JAW].square()
-        ranges = self.ranges
-        outside = terms.range_loss(ranges.of(vectors), ranges.low, ranges.high)
+        limits = self.joint_limits
+        outside = terms.joint_limit_loss(limits.of(vectors), limits.low, limits.high)
         return (
             4 * pose.sum(1)
             + 0.45 * hands.sum(1)

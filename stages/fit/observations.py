@@ -1,11 +1,11 @@
-"""What the fit aims at: which points of the body were seen where, and which of them to trust.
+"""Observations that the fit aims at: points of the body, where they were seen, and which to trust.
 
 The binary mask m_j of Eq. 2 is made here. A point is masked when its score is under tau, when it lies
 outside the picture, or when one of these rules says that it is a guess:
 
 - hips of somebody whose knees are not in the picture;
 - the pose estimator's face where a face mesh was found, and its hand where a hand was found;
-- a hand that ``hands.py`` does not trust, and the face where ``facing.py`` finds it turned away.
+- a hand that ``hand_trust.py`` does not trust, and the face where ``face_direction.py`` finds it turned away.
 
 Without the mask, which is the paper's ablation, every detection counts that the estimator returned at all.
 """
@@ -21,8 +21,8 @@ from torch import Tensor
 from pipeline import keypoints as coco
 from pipeline.body.landmarks import Landmarks, PointSet, join
 from pipeline.keypoints import Keypoints
-from stages.fit.facing import POSE_TURNED, TURNED, mesh_facing, points_facing
-from stages.fit.hands import trusted_flat_hands, trusted_hands
+from stages.fit.face_direction import POSE_TURNED, TURNED, mesh_facing, points_facing
+from stages.fit.hand_trust import trusted_flat_hands, trusted_hands
 
 GROUPS = ("body", "left_hand", "right_hand", "face")
 """The groups that residuals are reported by; ``Observations.group`` holds indices into it."""
@@ -47,7 +47,7 @@ _LIMB_DIRECTION, _PALM_DIRECTION, _FINGER_DIRECTION = 20.0, 10.0, 0.2
 
 @dataclasses.dataclass(frozen=True)
 class Directions:
-    """Where bones point in three dimensions, for L bones.
+    """Directions of L bones in three dimensions.
 
     Attributes:
         start, end: [L], indices of observed points.
@@ -91,7 +91,7 @@ class Observations:
     shoulders: tuple[int, int]
 
     def of(self, group: str) -> Tensor:
-        """Which points belong to a group: [N] bool."""
+        """The points of a group: [N] bool."""
         return self.group == GROUPS.index(group)
 
 
@@ -112,7 +112,7 @@ def observe(
         sizes: [T, 2], width and height of each frame in pixels.
         masked: False sets m = 1 for every finite detection with a place or a score.
         facing: [T], cosine between the initial pose's face and the way to the camera, where one is
-            known (``facing.pose_facing``); asked only where the face's points have no depth.
+            known (``face_direction.pose_facing``); asked only where the face's points have no depth.
     """
     if (keypoints.pose_image[..., 3] > 0).any():
         return _from_mediapipe(keypoints, landmarks, threshold, sizes, masked)
@@ -222,7 +222,7 @@ def _assemble(
     hands: np.ndarray,
     shoulders: tuple[int, int],
 ) -> Observations:
-    """From the group, pixels, mask and weight of N points; ``vague`` and ``hands`` are indices."""
+    """Observations from group, pixels, mask and weight of N points; ``vague`` and ``hands`` are indices."""
     group, pixels, mask, weight = arrays
     rows = np.arange(len(group))
     return Observations(
@@ -241,7 +241,7 @@ def _assemble(
 
 
 def visible(points: np.ndarray, threshold: float, sizes: np.ndarray) -> np.ndarray:
-    """Which points are scored at least ``threshold``, finite, and inside the picture.
+    """The points that are scored at least ``threshold``, finite, and inside the picture: [T, ...] bool.
 
     Args:
         points: [T, ..., C], x and y first, the score last.
@@ -255,7 +255,7 @@ def visible(points: np.ndarray, threshold: float, sizes: np.ndarray) -> np.ndarr
 
 
 def detected(points: np.ndarray) -> np.ndarray:
-    """Which points an estimator returned at all: finite, and with a place or a score. [T, ..., C]."""
+    """The points that an estimator returned, finite and with a place or a score: [T, ..., C] -> [T, ...]."""
     return np.isfinite(points).all(-1) & ((points[..., :2] != 0).any(-1) | (points[..., -1] > 0))
 
 
@@ -274,7 +274,7 @@ def drop_guesses(
 
 
 def _pose_weights() -> np.ndarray:
-    """How much each of the 33 pose points counts: joints most, the vague points of face and hand least."""
+    """Weights of the 33 pose points: joints count most, the vague points of face and hand least."""
     weight = np.ones(33)
     weight[[1, 2, 3, 4, 5, 6, 9, 10]] = 0.3
     weight[11:17] = 1.5
@@ -310,7 +310,7 @@ def _hand_directions(hands: np.ndarray, mask: np.ndarray) -> Directions:
 
 
 def _both(mask: np.ndarray, bones: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """[T, K] -> [T, L]: whether both ends of each bone are seen."""
+    """Bones of which both ends are seen: [T, K] bool -> [T, L] bool."""
     pairs = np.array(bones, np.int64)
     return mask[:, pairs[:, 0]] & mask[:, pairs[:, 1]]
 

@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import BodyModel, Identity, Poses, draw_mesh, pose_body
+from pipeline.body import BodyModel, Identity, Poses, draw_mesh, posed_vertices
 from pipeline.camera import Camera
 from pipeline.frames import read_frame, read_mask
+from pipeline.pictures import contact_sheet, resized, side_by_side
 
+SHEET_FRAMES = 6
 _EDGE = (255, 210, 0)  # RGB of the mask's outline
 
 
@@ -34,17 +36,10 @@ def overlays(
         frames: the folder of the clip's pictures.
         opacity: of the mesh, 0 to 1.
     """
-    for row, frame in enumerate(poses.frames):
+    for frame in poses.frames:
         with torch.no_grad():
-            one = slice(row, row + 1)
-            pose = poses.rotation[one], poses.expression[one], poses.transl[one]
-            vertices, _ = pose_body(body, identity, *pose)
-        yield draw_mesh(read_frame(frames, frame), cameras[frame], vertices[0], body.faces, opacity=opacity)
-
-
-def sheet_rows(count: int, wanted: int = 6) -> list[int]:
-    """Rows spread evenly over ``count``, the first and the last among them."""
-    return sorted({round(k * (count - 1) / max(wanted - 1, 1)) for k in range(wanted)})
+            vertices = posed_vertices(body, identity, poses.pose(frame))
+        yield draw_mesh(read_frame(frames, frame), cameras[frame], vertices, body.faces, opacity=opacity)
 
 
 def sheet_tile(frame: np.ndarray, mask: np.ndarray, drawn: np.ndarray, height: int = 360) -> np.ndarray:
@@ -57,24 +52,11 @@ def sheet_tile(frame: np.ndarray, mask: np.ndarray, drawn: np.ndarray, height: i
     """
     contours, _ = cv2.findContours((mask > 127).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     pair = [cv2.drawContours(picture.copy(), contours, -1, _EDGE, 1) for picture in (frame, drawn)]
-    both = np.concatenate(pair, axis=1)
-    width = round(both.shape[1] * height / both.shape[0])
-    method = cv2.INTER_AREA if height < both.shape[0] else cv2.INTER_LINEAR
-    return cv2.resize(both, (width, height), interpolation=method)
-
-
-def contact_sheet(tiles: list[np.ndarray], columns: int = 2) -> np.ndarray:
-    """Tiles of one height in a grid, the last row filled with black."""
-    blank = np.zeros_like(tiles[0])
-    width = tiles[0].shape[1]
-    padded = [cv2.resize(tile, (width, len(tile))) if tile.shape[1] != width else tile for tile in tiles]
-    padded += [blank] * (-len(tiles) % columns)
-    rows = [np.concatenate(padded[k : k + columns], axis=1) for k in range(0, len(padded), columns)]
-    return np.concatenate(rows, axis=0)
+    return resized(side_by_side(pair), height, cv2.INTER_LINEAR)
 
 
 def sheet(frames: Path, masks: Path, poses: Poses, drawn: Mapping[int, np.ndarray]) -> np.ndarray:
-    """The contact sheet of some overlays.
+    """The contact sheet of some overlays, two in a row, each beside its frame.
 
     Args:
         frames, masks: folders of the clip's pictures.
@@ -85,4 +67,6 @@ def sheet(frames: Path, masks: Path, poses: Poses, drawn: Mapping[int, np.ndarra
     for row in sorted(drawn):
         number = poses.frames[row]
         tiles.append(sheet_tile(read_frame(frames, number), read_mask(masks, number), drawn[row]))
-    return contact_sheet(tiles)
+    width = tiles[0].shape[1]  # cameras of one rig may differ in size
+    tiles = [cv2.resize(one, (width, len(one))) if one.shape[1] != width else one for one in tiles]
+    return contact_sheet(tiles, columns=2)

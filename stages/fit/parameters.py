@@ -1,4 +1,4 @@
-"""What is optimised, and the landmarks that it poses.
+"""The parameters that are optimised, and the landmarks that they pose.
 
 Only the landmarks are posed, not the mesh. Every landmark is a point with skinning weights: a joint is
 a point that moves rigidly with it, and a point on the surface mixes rest position and weights of its
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from pipeline.body import BodyModel, matrix_transforms, mean_identity, rest_joints, skin
+from pipeline.body import BodyModel, forward_kinematics, linear_blend_skinning, mean_identity, rest_joints
 from pipeline.body.joints import BODY_POSE, GLOBAL_ORIENT, JAW
 from pipeline.body.landmarks import PointSet
 
@@ -179,9 +179,9 @@ class LandmarkModel:
         flat = self.expression.flatten(0, 1)
         points = rest + (parameters.expression @ flat.mT).unflatten(1, self.rest.shape)
         joints = self.joints + self.joint_shape @ parameters.betas + parameters.joint_offset
-        transforms, moved = matrix_transforms(matrices, joints, self.parents)
+        transforms, moved = forward_kinematics(matrices, joints, self.parents)
         place = parameters.transl[:, None]
-        return skin(transforms, self.weights, points) + place, moved + place
+        return linear_blend_skinning(transforms, self.weights, points) + place, moved + place
 
 
 def landmark_model(body: BodyModel, points: PointSet, betas: int, spread: Tensor) -> LandmarkModel:

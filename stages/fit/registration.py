@@ -15,20 +15,18 @@ from pipeline.camera import Camera
 from pipeline.curves import Curve
 from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
+from pipeline.numba_kernels import threads
 from pipeline.pose_files import InitialPoses
-from pipeline.threads import threads
-from stages.fit.doubt import without_doubted
+from stages.fit.adam import Recorder, optimise
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initial_poses import initial_facing, initial_from_files
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.objective import Face, Objective
 from stages.fit.observations import Observations, observe
-from stages.fit.optimise import Watch, optimise
+from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
-from stages.fit.pose_start import initial_facing, initial_from_files
-from stages.fit.progress import Recorder
 from stages.fit.settings import FitSettings
-from stages.fit.solver import STEPS, solve
 from stages.fit.views import Views, stack
 
 
@@ -55,7 +53,7 @@ class Registration:
     face_frames: int = 0
 
 
-@threads(1)  # sums of many threads differ in their last digits, also those before and after the solver
+@threads(1)  # sums of many threads differ in their last digits, also those before and after Adam
 def register(
     body: BodyModel,
     landmarks: Landmarks,
@@ -82,7 +80,7 @@ def register(
         UserError: a frame has no camera, or there are no frames.
     """
     views = views_of(keypoints, cameras)
-    keypoints = believed(keypoints, log) if settings.masked else keypoints
+    keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
     observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
@@ -105,34 +103,25 @@ def register(
         face = Face(target, landmark_model(body, target.points, betas, spread))
     objective = Objective(body, observations, model, views, initial, movable, settings, face)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
-    recorder = Recorder(objective, steps_of(settings), report)
+    recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
-    fitted = _minimised(objective, initial, frozen, settings, recorder)
+    rate, size = settings.learning_rate, settings.minibatch
+    fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
     identity, poses = _outcome(objective, fitted, spread)
     error = objective.residuals(fitted)
     seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
     return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
 
 
-def believed(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
-    """The detections without those of frames that are not believed, see ``doubt.py``."""
-    keypoints, doubted = without_doubted(keypoints)
-    if doubted:
+def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+    """The detections with outlier frames masked, see ``outlier_frames.py``; the log names these frames."""
+    keypoints, outliers = mask_outlier_frames(keypoints)
+    if outliers:
         log(
-            f"frame {', '.join(map(str, doubted))}: left and right are exchanged, or the points are nowhere "
+            f"frame {', '.join(map(str, outliers))}: left and right are exchanged, or the points are nowhere "
             "near those of the frames around; body and hands are not believed there"
         )
     return keypoints
-
-
-def _minimised(
-    objective: Objective, initial: Parameters, frozen: frozenset[str], settings: FitSettings, watch: Watch
-) -> Parameters:
-    """The parameters that the chosen solver arrives at."""
-    if settings.solver == "lm" and settings.iterations > 0:
-        return solve(objective, initial, frozen, settings.minibatch, watch)
-    rate, size = settings.learning_rate, settings.minibatch
-    return optimise(objective, initial, settings.iterations, frozen, rate, size, watch)
 
 
 def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[Identity, Poses]:
@@ -144,11 +133,6 @@ def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[
         identity = Identity(fitted.betas, fitted.joint_offset, spread @ fitted.face_control)
     frames, measured = tuple(observations.frames.tolist()), observations.mask.any(1)
     return identity, Poses(frames, rotation, fitted.expression, fitted.transl, measured)
-
-
-def steps_of(settings: FitSettings) -> int:
-    """How many steps a fit takes at most: Adam as many as are set, the second-order solver its own number."""
-    return STEPS if settings.solver == "lm" and settings.iterations > 0 else settings.iterations
 
 
 def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:

@@ -8,8 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import torch
 import trimesh
+from torch import Tensor
 
 from pipeline.body import (
     BodyModel,
@@ -23,17 +25,23 @@ from pipeline.body import (
 )
 from pipeline.camera import Camera
 from pipeline.frames import write_png, write_video
+from pipeline.json_files import write_json
 from pipeline.keypoints import read_keypoints
+from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import read_cameras, read_footage, write_json
+from pipeline.records import read_cameras, read_footage
+from pipeline.spread import spread_end_to_end
 from pipeline.stage import Context
-from pipeline.threads import threads
-from stages.fit.overlay import overlays, sheet, sheet_rows
-from stages.fit.pose_given import given_poses, keep_given
-from stages.fit.registration import Registration, register, steps_of, views_of
-from stages.fit.residuals import group_means, write_residuals
+from pipeline.tables import write_table
+from stages.fit.initial_poses import given_poses, keep_given
+from stages.fit.observations import GROUPS, Observations
+from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
+from stages.fit.registration import Registration, register, views_of
 from stages.fit.smoothing import smooth
 
+RESIDUALS_SCHEMA = pa.schema(
+    [("frame", pa.int32()), ("group", pa.string()), ("point", pa.int32()), ("pixels", pa.float32())]
+)
 _FPS = 25.0  # of the overlay, where the footage has no clock
 
 
@@ -81,7 +89,7 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         kept = keep_given(initial, body, views_of(keypoints, cameras))
         settings = dataclasses.replace(settings, iterations=0, face="off")
         context.log("publishes the poses that came with the footage as they are")
-    with context.progress(steps_of(settings), "registration") as progress:
+    with context.progress(settings.iterations, "registration") as progress:
 
         def report(note: str) -> None:
             progress.advance(1, note)
@@ -101,6 +109,42 @@ def write_motion(
         write_peer_files(folder, body, fitted.identity, fitted.poses, smoothed, cameras, mean)
 
 
+def group_means(error: Tensor, observations: Observations) -> dict[str, float]:
+    """Mean error over the clip of each group that was seen, pixels.
+
+    Args:
+        error: [T, N], pixels, NaN where masked.
+        observations: whose points they are.
+    """
+    means = {name: error[:, observations.of(name)].nanmean() for name in GROUPS}
+    return {name: float(mean) for name, mean in means.items() if torch.isfinite(mean)}
+
+
+def write_residuals(path: Path, error: Tensor, observations: Observations) -> None:
+    """Write ``residuals.parquet``, a row a keypoint that was trusted in a frame.
+
+    Columns: ``frame``; ``group`` and ``point``, the keypoint as the number that its source gives it within
+    the group; ``pixels``, its reprojection error. Masked keypoints have no row.
+
+    Args:
+        path: the file.
+        error: [T, N], pixels, NaN where masked.
+        observations: whose points they are.
+    """
+    group = observations.group.numpy()
+    within = np.zeros(len(group), np.int32)
+    for number in range(len(GROUPS)):
+        within[group == number] = np.arange((group == number).sum())
+    rows, points = np.nonzero(~np.isnan(error.numpy()))
+    columns = {
+        "frame": observations.frames.numpy()[rows].astype(np.int32),
+        "group": np.array(GROUPS, dtype=object)[group[points]],
+        "point": within[points],
+        "pixels": error.numpy()[rows, points],
+    }
+    write_table(path, RESIDUALS_SCHEMA, columns)
+
+
 def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
     """Write the identity's mesh in T pose as binary PLY, metres."""
     with torch.no_grad():
@@ -114,7 +158,7 @@ def write_overlays(
 ) -> None:
     """Write ``overlay.mp4``, every frame, and ``overlay.png``, a contact sheet."""
     ingest = context.inputs["ingest"]
-    wanted, kept = sheet_rows(len(poses)), {}
+    wanted, kept = spread_end_to_end(range(len(poses)), SHEET_FRAMES), {}
     opacity = context.settings.overlay_opacity
 
     def drawing() -> Iterator[np.ndarray]:

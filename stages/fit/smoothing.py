@@ -142,7 +142,7 @@ def _runs(times: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weights(offsets: np.ndarray, there: np.ndarray, order: int) -> np.ndarray:
-    """What each neighbour contributes to a least-squares polynomial's value at offset 0.
+    """The share of each neighbour in a least-squares polynomial's value at offset 0.
 
     Args:
         offsets: [I, K], times relative to where the polynomial is read off.

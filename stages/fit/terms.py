@@ -100,7 +100,7 @@ def direction_loss(start: Tensor, end: Tensor, unit: Tensor) -> Tensor:
 
 
 def in_front_loss(depth: Tensor, chest: Tensor, distance: float) -> Tensor:
-    """How much points seen before the chest lie nearer to it than ``distance``, squared.
+    """The depth by which points seen before the chest are not ``distance`` in front of it, squared.
 
     With one camera the depth of a hand is free, and hands sink into the torso.
 
@@ -115,8 +115,8 @@ def in_front_loss(depth: Tensor, chest: Tensor, distance: float) -> Tensor:
     return (depth - (chest[:, None] - distance)).clamp_min(0).square()
 
 
-def range_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """How far angles lie outside what a joint can do, squared.
+def joint_limit_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The squared angle by which components of a rotation lie outside the joint's limits.
 
     Args:
         angle: [..., K], radians.

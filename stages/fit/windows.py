@@ -1,4 +1,4 @@
-"""A long clip in pieces: which frames are posed together, and which of them count.
+"""Windows of a long clip: frames that are posed together, and those of them that count.
 
 A window counts its own frames and poses one more on either side, which accelerations and velocities
 look at. Every term of a clip belongs to exactly one window, so the windows' losses add up to the loss of
@@ -55,7 +55,7 @@ def windows(count: int, size: int) -> list[Window]:
 
 
 def bumps(times: Tensor, width: float, low: int = 0, high: int | None = None) -> tuple[Tensor, int, int]:
-    """What a step of each frame moves of the frames ``low`` to ``high`` - 1.
+    """Weights that spread each frame's step over the frames ``low`` to ``high`` - 1.
 
     A step spreads over time as a Gaussian that ends at three standard deviations.
 

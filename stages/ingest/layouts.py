@@ -4,6 +4,9 @@ Written here, because settings are checked where nothing heavy is imported; each
 ``stages/ingest/datasets``.
 """
 
-LAYOUTS = (
-    "zju", "wildavatar", "insta", "xhumans", "persona", "pose2sim", "neuman", "prepared", "talkshow", "plain",
-)  # fmt: skip
+from typing import Literal, get_args
+
+Layout = Literal[
+    "zju", "wildavatar", "insta", "xhumans", "persona", "pose2sim", "neuman", "prepared", "talkshow", "plain"
+]  # fmt: skip
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)

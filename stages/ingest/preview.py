@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,6 +9,8 @@ import numpy as np
 
 from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.keypoints import BODY, FACE, FEET, LEFT_HAND, RIGHT_HAND, Keypoints
+from pipeline.pictures import contact_sheet
+from pipeline.spread import spread_end_to_end
 
 COLOURS = ((BODY, (255, 80, 60)), (FEET, (255, 170, 40)), (FACE, (250, 240, 90)), (LEFT_HAND, (80, 220, 255)),
            (RIGHT_HAND, (150, 130, 255)))  # fmt: skip
@@ -40,9 +41,10 @@ def draw_frame(image: np.ndarray, mask: np.ndarray, points: np.ndarray, threshol
 
 def write_preview(path: Path, frames: Path, masks: Path, keypoints: Keypoints) -> None:
     """Write the contact sheet of at most twelve frames spread over the clip."""
-    rows = np.unique(np.linspace(0, len(keypoints.frames) - 1, FEW).round().astype(int))
-    tiles = [_tile(frames, masks, keypoints, int(row)) for row in rows]
-    write_png(path, _grid(tiles, 4 if tiles[0].shape[1] >= tiles[0].shape[0] else 6))
+    rows = spread_end_to_end(range(len(keypoints.frames)), FEW)
+    tiles = [_tile(frames, masks, keypoints, row) for row in rows]
+    columns = 4 if tiles[0].shape[1] >= tiles[0].shape[0] else 6
+    write_png(path, contact_sheet(tiles, min(columns, len(tiles))))  # cameras of one rig may differ in size
 
 
 def _tile(frames: Path, masks: Path, keypoints: Keypoints, row: int) -> np.ndarray:
@@ -52,16 +54,3 @@ def _tile(frames: Path, masks: Path, keypoints: Keypoints, row: int) -> np.ndarr
     tile = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     cv2.putText(tile, str(index), (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return tile
-
-
-def _grid(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    # Cameras of one rig may differ by some pixels.
-    height, width = (max(tile.shape[side] for tile in tiles) for side in (0, 1))
-    tiles = [
-        np.pad(tile, ((0, height - tile.shape[0]), (0, width - tile.shape[1]), (0, 0))) for tile in tiles
-    ]
-    blank = np.zeros_like(tiles[0])
-    padded = [*tiles, *[blank] * (-len(tiles) % min(columns, len(tiles)))]
-    across = min(columns, len(tiles))
-    rows = [np.concatenate(padded[at : at + across], axis=1) for at in range(0, len(padded), across)]
-    return np.concatenate(rows)

@@ -12,7 +12,7 @@ from pipeline.body import rest_joints
 from pipeline.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
 from pipeline.visibility import LEAST_CUT, evidence_threshold
 from stages.plan.measure import (
-    Clip,
+    PlanInputs,
     gaussian_pixels,
     mean_error,
     part_pixels,
@@ -49,24 +49,24 @@ FIT_PIXELS = 0.25  # under a quarter of a pixel there is nothing left to refine
 HELD_OUT_PIXELS = 4.0  # of mean error: beyond, held-out scores judge the fit rather than the avatar
 
 
-def decide(clip: Clip, settings: PlanSettings) -> Plan:
+def decide(inputs: PlanInputs, settings: PlanSettings) -> Plan:
     """The plan of a clip."""
-    scores, seen = visibility(clip)
+    scores, seen = visibility(inputs)
     decisions = [
-        structure_from_motion(clip),
-        face_registration(clip),
+        structure_from_motion(inputs),
+        face_registration(inputs),
         *(part_seen(part, seen) for part in SEEN_PARTS),
         gate(scores),
-        azimuths(clip),
-        subdivision(clip),
-        poses_follow(clip),
-        refinement(clip),
-        test_time(clip),
+        azimuths(inputs),
+        subdivision(inputs),
+        poses_follow(inputs),
+        refinement(inputs),
+        test_time(inputs),
     ]
     made = {one.effect: forced(one, settings) for one in decisions}
     for part in ("face", "left_hand", "right_hand"):
-        made[f"{part}_residual"] = forced(residual(clip, part, made[f"seen_{part}"].on), settings)
-    made["face_loss"] = forced(face_loss(clip, made), settings)
+        made[f"{part}_residual"] = forced(residual(inputs, part, made[f"seen_{part}"].on), settings)
+    made["face_loss"] = forced(face_loss(inputs, made), settings)
     return Plan(tuple(made[name] for name in EFFECTS))
 
 
@@ -81,9 +81,9 @@ def forced(decision: Decision, settings: PlanSettings) -> Decision:
     return dataclasses.replace(decision, on=choice == "on", why=why, forced=True)
 
 
-def structure_from_motion(clip: Clip) -> Decision:
+def structure_from_motion(inputs: PlanInputs) -> Decision:
     """What ingest decided about the cameras."""
-    record = clip.footage.camera
+    record = inputs.clip.footage.camera
     source, moved = record.get("source", "known"), record.get("displacement")
     on = source in ("sfm", "rotation")
     if moved is not None:
@@ -100,10 +100,10 @@ def structure_from_motion(clip: Clip) -> Decision:
     )  # fmt: skip
 
 
-def face_registration(clip: Clip) -> Decision:
+def face_registration(inputs: PlanInputs) -> Decision:
     """What fit decided about the face."""
-    found, frames = clip.face["registered"], clip.face["frames"]
-    off = clip.face["source"] == "off"
+    found, frames = inputs.face["registered"], inputs.face["frames"]
+    off = inputs.face["source"] == "off"
     why = "switched off by fit.face=off" if off else f"{found} of {frames} frames show a face to register"
     return Decision("face_registration", found > 0, found, 1.0, "frames with a face", why, forced=off)
 
@@ -115,9 +115,9 @@ def part_seen(effect: str, seen: Mapping[str, float]) -> Decision:
     return Decision(effect, share >= PART_SEEN, share, PART_SEEN, "of its vertices in one frame", why)
 
 
-def residual(clip: Clip, part: str, seen: bool) -> Decision:
+def residual(inputs: PlanInputs, part: str, seen: bool) -> Decision:
     """Whether a part shows enough pixels for colours of its own in each frame."""
-    pixels, name = part_pixels(clip, part), part.replace("_", " ")
+    pixels, name = part_pixels(inputs.clip, part), part.replace("_", " ")
     on = seen and pixels >= RESIDUAL_PIXELS
     if not seen:
         why = f"the {name} is never seen"
@@ -128,9 +128,9 @@ def residual(clip: Clip, part: str, seen: bool) -> Decision:
     return Decision(f"{part}_residual", on, pixels, RESIDUAL_PIXELS, "pixels across", why)
 
 
-def face_loss(clip: Clip, made: Mapping[str, Decision]) -> Decision:
+def face_loss(inputs: PlanInputs, made: Mapping[str, Decision]) -> Decision:
     """Whether there is a registered face large enough to be compared."""
-    pixels, registered = part_pixels(clip, "face"), made["face_registration"].on
+    pixels, registered = part_pixels(inputs.clip, "face"), made["face_registration"].on
     on = registered and made["seen_face"].on and pixels >= RESIDUAL_PIXELS
     why = f"the registered face is {pixels:.0f} pixels across" if registered else "no face was registered"
     return Decision("face_loss", on, pixels, RESIDUAL_PIXELS, "pixels across", why)
@@ -143,10 +143,10 @@ def gate(scores: np.ndarray) -> Decision:
     return Decision("visibility_gate", found.closed, cut, LEAST_CUT, "of the body's vertices", found.why)
 
 
-def azimuths(clip: Clip) -> Decision:
+def azimuths(inputs: PlanInputs) -> Decision:
     """Whether a side of the body is never seen."""
-    joints = rest_joints(clip.body, clip.identity)
-    widest, unseen = unseen_azimuths(clip, joints)
+    joints = rest_joints(inputs.clip.body, inputs.clip.identity)
+    widest, unseen = unseen_azimuths(inputs.clip, joints)
     on = widest > UNSEEN_RANGE
     why = (
         f"{len(unseen)} of 12 sides are never seen, the widest range without a frame has {widest:.0f} degrees"
@@ -154,34 +154,34 @@ def azimuths(clip: Clip) -> Decision:
     return Decision("auxiliary_views", on, widest, UNSEEN_RANGE, "degrees never seen", why, values=unseen)
 
 
-def subdivision(clip: Clip) -> Decision:
+def subdivision(inputs: PlanInputs) -> Decision:
     """Whether there are more pixels than Gaussians, a vertex of the body each; and for how many levels."""
-    pixels = gaussian_pixels(clip)
+    pixels = gaussian_pixels(inputs)
     levels = max(0, math.ceil(math.log2(pixels / GAUSSIAN_PIXELS))) if pixels else 0
     why = f"the body's vertices that a training frame shows stand {pixels:.1f} pixels apart"
     return Decision("subdivision", levels > 0, pixels, GAUSSIAN_PIXELS, "pixels apart", why, values=(levels,))
 
 
-def poses_follow(clip: Clip) -> Decision:
+def poses_follow(inputs: PlanInputs) -> Decision:
     """Whether the pose changes enough for shape and colour to follow it."""
-    change = pose_change(clip)
+    change = pose_change(inputs.clip)
     why = f"the keypoints change their shape by {change:.1%} of the person's size"
     return Decision("pose_heads", change >= POSE_CHANGE, change, POSE_CHANGE, "of the person's size", why)
 
 
-def refinement(clip: Clip) -> Decision:
+def refinement(inputs: PlanInputs) -> Decision:
     """Whether the fit leaves the training frames' poses anything to gain."""
-    pixels = mean_error(clip, clip.split.train)
+    pixels = mean_error(inputs, inputs.clip.split.train)
     why = f"the fit's points are {pixels:.2f} pixels off in training frames"
     return Decision("pose_refinement", pixels >= FIT_PIXELS, pixels, FIT_PIXELS, "pixels", why)
 
 
-def test_time(clip: Clip) -> Decision:
+def test_time(inputs: PlanInputs) -> Decision:
     """Whether held-out poses are too far off for their scores to say much of the avatar."""
-    pixels = mean_error(clip, clip.split.test)
+    pixels = mean_error(inputs, inputs.clip.split.test)
     why = (
         f"the fit's points are {pixels:.2f} pixels off in held-out frames"
-        if clip.split.test
+        if inputs.clip.split.test
         else ("no frame is held out")
     )
     return Decision("test_time_refinement", pixels >= HELD_OUT_PIXELS, pixels, HELD_OUT_PIXELS, "pixels", why)

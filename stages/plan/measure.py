@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
-from pipeline.body import PARTS, BodyModel, Identity, Poses, pose_body, read_identity, read_poses
+from pipeline.body import PARTS, pose_body
+from pipeline.boxes import MARGIN
 from pipeline.camera import Camera, project, to_camera
+from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.errors import UserError
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, read_keypoints
-from pipeline.person import MARGIN, person_box
+from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.plan import AZIMUTH_STEP
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_json, read_split, spread
+from pipeline.records import read_json
 from pipeline.tables import read_table
 from pipeline.visibility import body_in_frame
 
@@ -37,51 +38,33 @@ RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
+class PlanInputs:
     """What the plan looks at.
 
     Attributes:
-        footage, split, keypoints: of ingest.
+        clip: the clip and the fitted person.
         cameras: of every frame, cropped to the person's box over the training frames.
-        body, identity, poses: the fitted person.
         errors: frame number -> mean reprojection error of its trusted keypoints, pixels.
         face: what fit says of face registration.
     """
 
-    footage: Footage
-    split: Split
-    keypoints: Keypoints
+    clip: FittedClip
     cameras: Mapping[int, Camera]
-    body: BodyModel
-    identity: Identity
-    poses: Poses
     errors: Mapping[int, float]
     face: Mapping[str, Any]
 
 
-def read_clip(ingest: Path, fit: Path, body: BodyModel) -> Clip:
-    """Reads it.
+def read_inputs(ingest: Path, fit: Path, body_file: Path) -> PlanInputs:
+    """Read what ingest and fit published.
 
     Raises:
         UserError: a file is missing or damaged, or the files do not go together.
     """
-    split, cameras = read_split(ingest / "split.json"), read_cameras(ingest / "cameras.parquet")
-    poses = read_poses(fit / "poses.parquet")
-    missing = sorted({*split.train, *split.test} - {*poses.frames} | {*poses.frames} - {*cameras})
-    if missing:
-        raise UserError(
-            f"{fit / 'poses.parquet'}: frame {missing[0]} has no pose or no camera; run fit again"
-        )
-    box = person_box(ingest, split.train, MARGIN)
-    size = (box.right - box.left, box.bottom - box.top)
-    return Clip(
-        footage=read_footage(ingest / "footage.json"),
-        split=split,
-        keypoints=read_keypoints(ingest / "keypoints.parquet"),
-        cameras={frame: camera.cropped(box.left, box.top, *size) for frame, camera in cameras.items()},
-        body=body,
-        identity=read_identity(fit / "identity.safetensors", body),
-        poses=poses,
+    clip = read_fitted_clip(ingest, fit, body_file)
+    box = clip.person_box(MARGIN)
+    return PlanInputs(
+        clip=clip,
+        cameras={frame: clip.camera(frame, box) for frame in clip.cameras},
         errors=_errors(fit / "residuals.parquet"),
         face=_face(fit / "face.json"),
     )
@@ -100,41 +83,38 @@ def _face(path: Path) -> dict[str, Any]:
     return content
 
 
-def visibility(clip: Clip) -> tuple[np.ndarray, dict[str, float]]:
+def visibility(inputs: PlanInputs) -> tuple[np.ndarray, dict[str, float]]:
     """How often the fitted body's vertices lie in the training frames' pictures.
 
     Returns:
         The scores, [V] in [0, 1], and for each part of the body the largest share of its vertices that a
         training frame shows.
     """
+    clip, cameras = inputs.clip, inputs.cameras
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
     surface = Avatar(clip.body, clip.identity, torch.arange(len(clip.body.v_template)), bare).surfaces[0]
     labels = surface.canonical.parts
     size = torch.bincount(labels, minlength=len(PARTS)).clamp_min(1)
     hits, most = torch.zeros(len(labels)), torch.zeros(len(PARTS))
     for frame in clip.split.train:
-        row = clip.poses.index(frame)
-        seen = body_in_frame(surface, clip.poses.rotation[row], clip.poses.transl[row], clip.cameras[frame])
+        seen = body_in_frame(surface, clip.pose(frame), cameras[frame])
         hits += seen
         most = torch.maximum(most, torch.bincount(labels[seen], minlength=len(PARTS)) / size)
     scores = (hits.double() / len(clip.split.train)).numpy()
     return scores, dict(zip(PARTS, most.tolist(), strict=True))
 
 
-def gaussian_pixels(clip: Clip) -> float:
+def gaussian_pixels(inputs: PlanInputs) -> float:
     """How far the body's vertices stand from each other in the picture, pixels.
 
     The root of the area that each has of what faces the camera within the person's box: the mean over
     ``LOOKED_AT`` training frames. 0 where none of them shows anything.
     """
-    frames = spread(clip.split.train, LOOKED_AT)
-    rows, poses = [clip.poses.index(frame) for frame in frames], clip.poses
-    vertices, _ = pose_body(
-        clip.body, clip.identity, poses.rotation[rows], poses.expression[rows], poses.transl[rows]
-    )
-    found = [
-        _spacing(seen, clip.body.faces, clip.cameras[f]) for seen, f in zip(vertices, frames, strict=True)
-    ]
+    clip, cameras = inputs.clip, inputs.cameras
+    frames = clip.spread(LOOKED_AT)
+    poses = clip.poses.select(frames)
+    vertices, _ = pose_body(clip.body, clip.identity, poses.rotation, poses.expression, poses.transl)
+    found = [_spacing(seen, clip.body.faces, cameras[f]) for seen, f in zip(vertices, frames, strict=True)]
     shown = [one for one in found if one > 0]
     return float(np.mean(shown)) if shown else 0.0
 
@@ -154,7 +134,7 @@ def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
     return math.sqrt(float(area[seen].abs().sum()) / (int(seen.sum()) / 2)) if seen.any() else 0.0
 
 
-def part_pixels(clip: Clip, part: str) -> float:
+def part_pixels(clip: FittedClip, part: str) -> float:
     """The diagonal of a part's box of trusted keypoints, pixels: the median over the frames that show it.
 
     0 where fewer than ``LEAST_FRAMES`` of the training frames show it.
@@ -168,7 +148,7 @@ def part_pixels(clip: Clip, part: str) -> float:
     return float(np.median(sizes))
 
 
-def pose_change(clip: Clip) -> float:
+def pose_change(clip: FittedClip) -> float:
     """How far the person changes shape in the picture, in parts of the person's size.
 
     Joints that are not seen are fitted to anything, so the fit's own angles say little here; the trusted
@@ -208,7 +188,7 @@ def _laid_over(points: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return (points - mine) * factor + theirs
 
 
-def unseen_azimuths(clip: Clip, joints: Tensor) -> tuple[float, tuple[float, ...]]:
+def unseen_azimuths(clip: FittedClip, joints: Tensor) -> tuple[float, tuple[float, ...]]:
     """The sides of the body that no training frame shows.
 
     Args:
@@ -220,9 +200,9 @@ def unseen_azimuths(clip: Clip, joints: Tensor) -> tuple[float, tuple[float, ...
     """
     seen = [False] * (360 // AZIMUTH_STEP)
     for frame in clip.split.train:
-        row = clip.poses.index(frame)
-        turn = roma.rotvec_to_rotmat(clip.poses.rotation[row, 0])
-        towards = turn.T @ (clip.cameras[frame].centre - clip.poses.transl[row] - joints[0])
+        pose = clip.pose(frame)
+        turn = roma.rotvec_to_rotmat(pose.global_orient)
+        towards = turn.T @ (clip.cameras[frame].centre - pose.transl - joints[0])
         azimuth = float(torch.rad2deg(torch.atan2(towards[0], towards[2])))
         seen[round(azimuth / AZIMUTH_STEP) % len(seen)] = True
     unseen = tuple(float(AZIMUTH_STEP * place) for place, one in enumerate(seen) if not one)
@@ -238,7 +218,7 @@ def _longest(seen: Sequence[bool]) -> int:
     return min(longest, len(seen))
 
 
-def mean_error(clip: Clip, frames: Sequence[int]) -> float:
+def mean_error(inputs: PlanInputs, frames: Sequence[int]) -> float:
     """Mean reprojection error of some frames, pixels; 0 where none has a trusted keypoint."""
-    errors = [clip.errors[frame] for frame in frames if frame in clip.errors]
+    errors = [inputs.errors[frame] for frame in frames if frame in inputs.errors]
     return float(np.mean(errors)) if errors else 0.0

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pipeline.body import load_body
+from pipeline.numba_kernels import threads
 from pipeline.plan import write_plan
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.plan.decide import decide
-from stages.plan.measure import read_clip
+from stages.plan.measure import read_inputs
 
 
 def run(context: Context) -> None:
@@ -17,8 +16,8 @@ def run(context: Context) -> None:
         UserError: what ingest or fit published cannot be used.
     """
     with threads(1):
-        clip = read_clip(context.inputs["ingest"], context.inputs["fit"], load_body(context.body_file))
-        plan = decide(clip, context.settings)
+        inputs = read_inputs(context.inputs["ingest"], context.inputs["fit"], context.body_file)
+        plan = decide(inputs, context.settings)
     write_plan(context.output / "plan.json", plan)
     for on, word in ((True, "on"), (False, "off")):
         names = [one.effect.replace("_", " ") for one in plan.decisions if one.on == on]

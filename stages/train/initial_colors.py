@@ -11,7 +11,7 @@ from pipeline.avatar import Avatar
 from pipeline.avatar.sparse import SparsePair
 from pipeline.device import moved
 from pipeline.splat import Gaussians, render
-from stages.train.data import Frames
+from stages.train.data import TrainingData
 from stages.train.poses import PoseRefinement
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # initial colours stay where the sigmoid still has a slope
@@ -40,7 +40,7 @@ def color_unseen(avatar: Avatar) -> None:
 def initial_color_logits(
     avatar: Avatar,
     poses: PoseRefinement,
-    views: Frames,
+    data: TrainingData,
     chosen: tuple[int, ...],
     made: tuple[int, ...] = (),
 ) -> Tensor:
@@ -53,13 +53,13 @@ def initial_color_logits(
     Args:
         avatar: untrained.
         poses: of every frame.
-        views: the frames.
+        data: the frames.
         chosen: frame numbers.
         made: generated frames; they are asked for what no chosen frame shows.
     """
-    total, weight = _summed_colors(avatar, poses, views, chosen)
+    total, weight = _summed_colors(avatar, poses, data, chosen)
     if made:
-        total_made, weight_made = _summed_colors(avatar, poses, views, made)
+        total_made, weight_made = _summed_colors(avatar, poses, data, made)
         # A little of what lies behind shines through: a back has weight in a front view, and its colours.
         unseen = weight / len(chosen) < SHINES_THROUGH * weight_made / len(made)
         total, weight = torch.where(unseen, total_made, total), torch.where(unseen, weight_made, weight)
@@ -68,7 +68,7 @@ def initial_color_logits(
 
 
 def _summed_colors(
-    avatar: Avatar, poses: PoseRefinement, views: Frames, chosen: tuple[int, ...]
+    avatar: Avatar, poses: PoseRefinement, data: TrainingData, chosen: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
     """The colours that frames show at each Gaussian, summed by blending weight, and the summed weights.
 
@@ -77,7 +77,7 @@ def _summed_colors(
     """
     total, weight = (torch.zeros(len(avatar), width, device=avatar.device) for width in (3, 1))
     for frame in chosen:
-        view = moved(views[frame], avatar.device)
+        view = moved(data.view(frame), avatar.device)
         with torch.no_grad():
             gaussians = _gaussians(avatar, poses, frame)
         colors = gaussians.colors.clone().requires_grad_()
@@ -106,5 +106,4 @@ def fill_from_neighbours(total: Tensor, weight: Tensor, neighbours: SparsePair) 
 
 
 def _gaussians(avatar: Avatar, poses: PoseRefinement, frame: int) -> Gaussians:
-    pose = poses.fitted(frame)
-    return avatar.gaussians(pose.rotation, pose.expression, pose.transl)
+    return avatar.gaussians(poses.fitted(frame))

@@ -11,12 +11,12 @@ from pipeline.curves import Curve
 from pipeline.device import moved
 from pipeline.guard import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
-from pipeline.metrics.image import psnr
+from pipeline.metrics.psnr import psnr
 from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
-from stages.train.data import Frames
-from stages.train.objective import Evidence, Objective
+from stages.train.data import TrainingData
+from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import VisibilityGate
@@ -41,7 +41,7 @@ class Trainer:
         self,
         avatar: Avatar,
         poses: PoseRefinement,
-        evidence: Evidence,
+        data: TrainingData,
         settings: TrainSettings,
         network: Lpips | None = None,
         gate: VisibilityGate | None = None,
@@ -51,13 +51,13 @@ class Trainer:
         Args:
             avatar: untrained.
             poses: fitted.
-            evidence: the training frames.
+            data: the training frames.
             settings: of the stage.
             network: LPIPS, if it has a weight.
             gate: counts what is seen, and gates the rest; None leaves all of the avatar active.
         """
         self.avatar, self.poses, self.settings, self.gate = avatar, poses, settings, gate
-        self.evidence, self.objective = evidence, Objective(avatar, poses, evidence, settings, network)
+        self.data, self.objective = data, Objective(avatar, poses, data, settings, network)
         self.objective.on_frame = None if gate is None else gate.count
         self.curve, self.iteration = Curve(), 0
         self.untrained: float | None = None
@@ -106,7 +106,7 @@ class Trainer:
         fine = schedule.reached(self.settings, self.settings.subdivide_from, self.iteration)
         return self.settings.subdivisions if fine else 0
 
-    def held_out(self, views: Frames, frames: tuple[int, ...]) -> float:
+    def held_out(self, frames: tuple[int, ...]) -> float:
         """Mean PSNR of the person on black in uncropped frames, at their fitted poses, dB.
 
         Of the level of subdivision that is trained now: the finer one is not ready before its time.
@@ -115,9 +115,9 @@ class Trainer:
         with torch.no_grad():
             decoded = self.avatar.decode(self.level)
             for frame in frames:
-                view, pose = moved(views[frame], self.avatar.device), self.poses.fitted(frame)
-                time = self.evidence.times.get(frame)
-                posed = self.avatar.pose(decoded, pose.rotation, pose.expression, pose.transl, time=time)
+                view, pose = moved(self.data.whole[frame], self.avatar.device), self.poses.fitted(frame)
+                time = self.data.clip.seconds.get(frame)
+                posed = self.avatar.pose(decoded, pose, time=time)
                 color = render(posed.gaussians, view.camera).color
                 values.append(psnr(color.clamp(0, 1), view.composite(color.new_zeros(3))))
         return sum(values) / len(values)

@@ -3,54 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.body import Pose
+from pipeline.clip import View
+from pipeline.composite import over
 from pipeline.device import moved
-from pipeline.metrics import Lpips
+from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses, schedule
-from stages.train.data import Frames, View
+from stages.train.data import TrainingData
 from stages.train.face import face_loss, face_triangles, paste
 from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.perceptual import crop, due, perceptual
-from stages.train.poses import FramePose, PoseRefinement
+from stages.train.poses import PoseRefinement
 from stages.train.regularisers import Regularisers
 from stages.train.settings import TrainSettings
 
 Terms = dict[str, Tensor]
-FrameHook = Callable[[FramePose, View], None]
+FrameHook = Callable[[Pose, View], None]
 """Called with the pose in which a frame was rendered, and the frame."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """The data that an avatar is learnt from.
-
-    Attributes:
-        views: crops of the training frames.
-        frames: the training frames' numbers.
-        times: seconds of frames from the clip's start; a frame without a clock is not in it.
-        texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
-            no term asks for it.
-    """
-
-    views: Frames
-    frames: tuple[int, ...]
-    times: Mapping[int, float]
-    texture: Tensor | None = None
-
-    @property
-    def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The captured and the generated frames, drawn as ``train.generated_every`` says."""
-        made = self.views.generated
-        return (
-            tuple(frame for frame in self.frames if frame not in made),
-            tuple(frame for frame in self.frames if frame in made),
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +55,8 @@ class Objective:
 
     Attributes:
         avatar, poses: what is trained.
-        evidence: what it is compared with.
+        data: what it is compared with.
+        texture: [N, 3], the data's, where the avatar is; None where no term asks for it.
         settings: the weights.
         on_frame: called after each rendering, if there is one.
         visibility_cache: which Gaussians each frame showed when it was last drawn.
@@ -89,7 +66,7 @@ class Objective:
         self,
         avatar: Avatar,
         poses: PoseRefinement,
-        evidence: Evidence,
+        data: TrainingData,
         settings: TrainSettings,
         network: Lpips | None = None,
     ):
@@ -98,7 +75,7 @@ class Objective:
         Args:
             avatar: what is trained; everything else goes where it is.
             poses: fitted; they move if they are refined.
-            evidence: the training frames, with a texture if the face loss has a weight.
+            data: the training frames, with a texture if the face loss has a weight.
             settings: the weights.
             network: LPIPS; must be given if it has a weight.
 
@@ -107,14 +84,15 @@ class Objective:
         """
         if settings.lpips and network is None:
             raise ValueError("the LPIPS term needs its network")
-        if settings.face and evidence.texture is None:
+        if settings.face and data.texture is None:
             raise ValueError("the face term needs a texture")
         self.avatar, self.poses, self.settings = avatar, poses, settings
-        self.evidence, self.regularisers = moved(evidence, avatar.device), Regularisers(settings)
+        self.data, self.regularisers = data, Regularisers(settings)
+        self.texture = moved(data.texture, avatar.device)
         self.network = None if network is None else network.to(avatar.device)
         self.on_frame: FrameHook | None = None
         count = len(avatar.surfaces[-1].canonical)
-        self.visibility_cache = FrameVisibilityCache(evidence.frames, count).to(avatar.device)
+        self.visibility_cache = FrameVisibilityCache(data.frames, count).to(avatar.device)
 
     def __call__(self, iteration: int, level: int, poses_move: bool) -> Terms:
         """The weighted terms, averaged over the frames of the step.
@@ -135,7 +113,7 @@ class Objective:
     def draw(self, position: int) -> Draw:
         """Everything random about the ``position``-th drawn frame of the run."""
         settings, seed = self.settings, self.settings.seed
-        frame = schedule.drawn_of_two(seed, *self.evidence.sources, settings.generated_every, position)
+        frame = schedule.drawn_of_two(seed, *self.data.sources, settings.generated_every, position)
         timeless = schedule.drawn_share(seed, schedule.TIME, position) < settings.time_dropout
         length = 6 * (self.poses.poses.rotation.shape[1] - 1)
         device = self.avatar.device
@@ -144,12 +122,12 @@ class Objective:
             frame=frame,
             background=schedule.drawn_background(seed, position).to(device),
             noise=settings.pose_noise * schedule.drawn_noise(seed, position, length).to(device),
-            time=None if timeless else self.evidence.times.get(frame),
+            time=None if timeless else self.data.clip.seconds.get(frame),
             place=schedule.drawn_share(seed, schedule.CROP, position),
         )
 
     def _frame_terms(self, decoded: Decoded, draw: Draw, level: int, poses_move: bool) -> Terms:
-        settings, view = self.settings, moved(self.evidence.views[draw.frame], self.avatar.device)
+        settings, view = self.settings, moved(self.data.view(draw.frame), self.avatar.device)
         pose = self.poses(draw.frame) if poses_move else self.poses.fitted(draw.frame)
         posed = self._pose(decoded, pose, draw, level)
         rendering = render(posed.gaussians, view.camera)
@@ -163,24 +141,23 @@ class Objective:
             terms["pose_change"] = settings.pose_change * self.poses.change(draw.frame)
         return terms
 
-    def _pose(self, decoded: Decoded, pose: FramePose, draw: Draw, level: int) -> Posed:
+    def _pose(self, decoded: Decoded, pose: Pose, draw: Draw, level: int) -> Posed:
         surface, rows = decoded.surface, None
         if self.settings.pose_seen_only:
             count = len(surface.canonical)
             rows = self.visibility_cache.visible_rows(draw.frame, level, count, surface.rows)
-        given = pose.rotation, pose.expression, pose.transl
-        return self.avatar.pose(decoded, *given, draw.noise, draw.time, rows)
+        return self.avatar.pose(decoded, pose, draw.noise, draw.time, rows)
 
     def _photometric(self, rendering: Rendering, view: View, draw: Draw) -> Terms:
         """L1, SSIM and LPIPS between rendering and frame, both over the drawn background."""
         settings = self.settings
-        image = losses.over(rendering.color, rendering.alpha, draw.background)
+        image = over(rendering.color, rendering.alpha, draw.background)
         target = view.composite(draw.background)
         if view.trust is not None:
             image = losses.blend_to_target(image, target, view.trust)
         weights = (settings.l1, settings.ssim, settings.lpips)
         l1, ssim, lpips = (settings.generated if view.generated and one else one for one in weights)
-        terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * losses.ssim(image, target)}
+        terms = {"l1": l1 * losses.l1(image, target), "ssim": ssim * ssim_loss(image, target)}
         if self.network is not None and lpips and self._lpips_due(draw):
             place = crop(view.alpha, settings.lpips_crop, draw.place)
             # As many times the weight, so that its mean over the run is that of a term of every frame.
@@ -194,8 +171,8 @@ class Objective:
         return begun and due(draw.position, settings.lpips_every)
 
     def _face_term(self, decoded: Decoded, posed: Posed, view: View) -> Tensor:
-        if self.evidence.texture is None:
+        if self.texture is None:
             raise ValueError("the face term needs a texture")
         canonical, means = decoded.surface.canonical, posed.gaussians.means
-        chosen, texture = face_triangles(canonical), decoded.surface.pick(self.evidence.texture)
+        chosen, texture = face_triangles(canonical), decoded.surface.pick(self.texture)
         return face_loss(paste(view.camera, means, canonical.faces, chosen, texture), view.color, view.alpha)

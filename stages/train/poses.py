@@ -2,27 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import torch
 from torch import Tensor, nn
 
-from pipeline.body import Poses
-
-
-@dataclasses.dataclass(frozen=True)
-class FramePose:
-    """One frame's pose.
-
-    Attributes:
-        rotation: [55, 3] rotation vectors, radians.
-        expression: [E].
-        transl: [3], metres.
-    """
-
-    rotation: Tensor  # [55, 3]
-    expression: Tensor  # [E]
-    transl: Tensor  # [3]
+from pipeline.body import Pose, Poses
+from pipeline.device import moved
 
 
 class PoseRefinement(nn.Module):
@@ -41,21 +25,20 @@ class PoseRefinement(nn.Module):
         """
         super().__init__()
         self.poses = poses
-        self.rows = {frame: row for row, frame in enumerate(poses.frames)}
-        still = poses.rotation[0], poses.expression[0], poses.transl[0]
-        self.rotation, self.expression, self.transl = (_each(frames, pose) for pose in still)
+        first = poses.pose(poses.frames[0])
+        self.rotation, self.expression = _each(frames, first.rotation), _each(frames, first.expression)
+        self.transl = _each(frames, first.transl)
 
-    def fitted(self, frame: int) -> FramePose:
+    def fitted(self, frame: int) -> Pose:
         """The pose that the fit gave a frame."""
-        row = self.rows[frame]
-        return FramePose(self.poses.rotation[row], self.poses.expression[row], self.poses.transl[row])
+        return self.poses.pose(frame)
 
-    def forward(self, frame: int) -> FramePose:
+    def forward(self, frame: int) -> Pose:
         """The refined pose of a training frame, the fitted pose of any other."""
         pose, name = self.fitted(frame), str(frame)
         if name not in self.rotation:
             return pose
-        return FramePose(
+        return Pose(
             pose.rotation + self.rotation[name],
             pose.expression + self.expression[name],
             pose.transl + self.transl[name],
@@ -71,13 +54,7 @@ class PoseRefinement(nn.Module):
         """Poses as they now are, of all frames or of some; on the CPU."""
         frames = self.poses.frames if frames is None else frames
         with torch.no_grad():
-            each = [self(frame) for frame in frames]
-        return Poses(
-            frames=frames,
-            rotation=torch.stack([pose.rotation for pose in each]).cpu(),
-            expression=torch.stack([pose.expression for pose in each]).cpu(),
-            transl=torch.stack([pose.transl for pose in each]).cpu(),
-        )
+            return moved(Poses.stack(frames, [self(frame) for frame in frames]), "cpu")
 
 
 def _each(frames: tuple[int, ...], pose: Tensor) -> nn.ParameterDict:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -12,69 +11,29 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.body import BodyModel, Identity, Poses, load_body, read_identity, read_poses, write_poses
+from pipeline.body import write_poses
 from pipeline.compiling import CompileTimer, compile_timer
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError
 from pipeline.frames import write_png
 from pipeline.metrics import Lpips
-from pipeline.person import person_box
+from pipeline.numba_kernels import threads
 from pipeline.plan import read_plan
-from pipeline.records import Split, read_cameras, read_footage, read_split, spread
 from pipeline.settings import as_dict
+from pipeline.spread import spread_from_start
 from pipeline.stage import Context
-from pipeline.threads import threads
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
-from stages.train.data import Frames
+from stages.train.data import TrainingData, read_training_data
 from stages.train.divergence import WATCHED, require_progress
-from stages.train.generated import BothFrames, Generated, joined, read_generated
 from stages.train.initial_colors import color_unseen, initial_color_logits
 from stages.train.loop import Trainer, describe, point_values
-from stages.train.objective import Evidence
 from stages.train.poses import PoseRefinement
 from stages.train.score_picture import score_picture
 from stages.train.settings import TrainSettings
+from stages.train.step_costs import step_costs
 from stages.train.timer import TrainingTimer
 from stages.train.visibility_gate import VisibilityGate, ever_in_frame, write_ungated
-
-
-@dataclasses.dataclass(frozen=True)
-class Inputs:
-    """The inputs of the stage.
-
-    Attributes:
-        body, identity, poses: the fitted person.
-        split: the frames to learn from and those held out.
-        crops: training frames around the person.
-        whole: uncropped frames.
-        times: seconds of frames from the clip's start, of all that have a time.
-        generated: frames that a model made of sides the camera never saw, if there are any.
-    """
-
-    body: BodyModel
-    identity: Identity
-    poses: Poses
-    split: Split
-    crops: Frames
-    whole: Frames
-    times: Mapping[int, float]
-    generated: Generated | None = None
-
-    @property
-    def views(self) -> Frames:
-        """Every frame that is learnt from, captured and generated."""
-        return BothFrames(self.crops, self.generated.views) if self.generated else self.crops
-
-    @property
-    def all_poses(self) -> Poses:
-        """The poses of captured and generated frames."""
-        return joined(self.poses, self.generated.poses) if self.generated else self.poses
-
-    def evidence(self, texture: Tensor | None) -> Evidence:
-        """The training frames, and the mean colours that they show, [N, 3]."""
-        made = self.generated.frames if self.generated else ()
-        return Evidence(self.views, (*self.split.train, *made), self.times, texture)
 
 
 def run(context: Context) -> None:
@@ -97,84 +56,60 @@ def run(context: Context) -> None:
 
 def train_subject(context: Context, compiled: CompileTimer) -> None:
     """Reads the inputs, trains what the plan calls for, and writes what is published."""
-    inputs = read_inputs(context)
+    data = read_training_data(context)
     settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
     device = resolve(settings.device)
     context.log(f"computes on {device}")
     context.timing("device", str(device))
-    refinement = PoseRefinement(moved(inputs.all_poses, device), inputs.split.train)
+    refinement = PoseRefinement(moved(data.poses, device), data.clip.split.train)
     started = time.monotonic()
-    avatar, texture = prepare(inputs, refinement, settings, context)
+    avatar, data = prepare(data, refinement, settings, context)
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
-    gate = VisibilityGate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
-    trainer = Trainer(avatar, refinement, inputs.evidence(texture), settings, network, gate)
+    gate = VisibilityGate(avatar, len(data.clip.body.v_template), settings) if settings.gate else None
+    trainer = Trainer(avatar, refinement, data, settings, network, gate)
     context.timing("prepare_seconds", time.monotonic() - started)
-    train(trainer, inputs, context, compiled)
+    train(trainer, context, compiled)
     trainer.require_finite()
-    publish(trainer, inputs, context)
+    publish(trainer, context)
 
 
-def publish(trainer: Trainer, inputs: Inputs, context: Context) -> None:
+def publish(trainer: Trainer, context: Context) -> None:
     """Writes the finished avatar, its poses, curve and visibility."""
-    avatar, output, body = trainer.avatar, context.output, inputs.body
+    avatar, output, clip = trainer.avatar, context.output, trainer.data.clip
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
         color_unseen(avatar)
     save_avatar(output / "avatar.safetensors", avatar)
-    write_poses(output / "poses.parquet", trainer.poses.refined(inputs.poses.frames))
+    write_poses(output / "poses.parquet", trainer.poses.refined(clip.poses.frames))
     trainer.curve.write(output / "curve.parquet")
     if trainer.gate is None:
-        write_ungated(output, len(body.v_template))
+        write_ungated(output, len(clip.body.v_template))
     else:
         scores, kept = trainer.gate.write(output)
-        write_png(output / "visibility.png", score_picture(body, avatar.identity, scores, kept))
-
-
-def read_inputs(context: Context) -> Inputs:
-    """Reads and checks what ingest and fit published."""
-    ingest, fit, settings = context.inputs["ingest"], context.inputs["fit"], context.settings
-    body = load_body(context.body_file)
-    poses, cameras, split = (
-        read_poses(fit / "poses.parquet"),
-        read_cameras(ingest / "cameras.parquet"),
-        read_split(ingest / "split.json"),
-    )
-    _check(fit / "poses.parquet", poses, split, set(cameras))
-    box = person_box(ingest, split.train, settings.crop_margin)
-    return Inputs(
-        body=body,
-        identity=read_identity(fit / "identity.safetensors", body),
-        poses=poses,
-        split=split,
-        crops=Frames(ingest, cameras, box),
-        whole=Frames(ingest, cameras),
-        times=dict(zip(sorted(cameras), read_footage(ingest / "footage.json").seconds, strict=False)),
-        generated=read_generated(context.inputs.get("auxiliary"), poses),
-    )
+        write_png(output / "visibility.png", score_picture(clip.body, avatar.identity, scores, kept))
 
 
 def prepare(
-    inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context
-) -> tuple[Avatar, Tensor | None]:
+    data: TrainingData, refinement: PoseRefinement, settings: TrainSettings, context: Context
+) -> tuple[Avatar, TrainingData]:
     """The untrained avatar on the poses' device: the vertices to keep of the body, in their initial colours.
 
     Returns:
-        The avatar, and the texture of the face loss, [N, 3]; None where it has no weight.
+        The avatar, and the data with the texture of the face loss where that has a weight.
     """
-    kept = keep(inputs, refinement, settings, context)
+    kept = keep(data, refinement, settings, context)
     # What is shown in its base colours in the end belongs to the avatar, though it is never trained.
     rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
-    body, identity, sizes = inputs.body, inputs.identity, architecture(settings)
-    avatar = Avatar(body, identity, rows, sizes, settings.seed, settings.half_precision)
+    clip, sizes = data.clip, architecture(settings)
+    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, settings.half_precision)
     avatar.to(refinement.poses.rotation.device)
     avatar.pose_heads_active = avatar.residuals_active = False
-    set_time_range(avatar, inputs)
-    texture = None
+    set_time_range(avatar, data)
     if settings.initial_color or settings.face:
-        chosen = spread(inputs.split.train, settings.color_frames)
-        made = spread(inputs.generated.frames, settings.color_frames) if inputs.generated else ()
-        logits = initial_color_logits(avatar.eval(), refinement, inputs.views, chosen, made)
-        texture = torch.sigmoid(logits) if settings.face else None
+        chosen, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
+        logits = initial_color_logits(avatar.eval(), refinement, data, chosen, made)
+        if settings.face:
+            data = dataclasses.replace(data, texture=torch.sigmoid(logits))
         if settings.initial_color:
             avatar.base_color.copy_(logits)
     avatar.gate(kept[rows].to(avatar.device))
@@ -183,19 +118,20 @@ def prepare(
         f"{int(kept.sum())} of {len(kept)} body vertices are kept, {len(avatar)} Gaussians; "
         f"residual colours of: {parts}"
     )
-    return avatar.train(), texture
+    return avatar.train(), data
 
 
-def keep(inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, context: Context) -> Tensor:
+def keep(data: TrainingData, refinement: PoseRefinement, settings: TrainSettings, context: Context) -> Tensor:
     """The body vertices that get a Gaussian to begin with, [V] bool on the CPU.
 
     Raises:
         UserError: no training frame has any of the body in its picture.
     """
-    everything = torch.arange(len(inputs.body.v_template))
+    clip = data.clip
+    everything = torch.arange(len(clip.body.v_template))
     bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
-    body = Avatar(inputs.body, inputs.identity, everything, bare).to(refinement.poses.rotation.device)
-    seen = ever_in_frame(body, refinement, inputs.crops, inputs.split.train)
+    body = Avatar(clip.body, clip.identity, everything, bare).to(refinement.poses.rotation.device)
+    seen = ever_in_frame(body, refinement, data.crops, clip.split.train)
     if not bool(seen.any()):
         raise UserError(f"{context.inputs['fit']}: the fitted body is outside every frame; run fit again")
     if not (settings.gate and settings.early_gate):
@@ -204,9 +140,10 @@ def keep(inputs: Inputs, refinement: PoseRefinement, settings: TrainSettings, co
     return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
 
 
-def set_time_range(avatar: Avatar, inputs: Inputs) -> None:
+def set_time_range(avatar: Avatar, data: TrainingData) -> None:
     """Tells the avatar's residual heads when the training frames were filmed."""
-    times = [inputs.times[frame] for frame in inputs.split.train if frame in inputs.times]
+    seconds = data.clip.seconds
+    times = [seconds[frame] for frame in data.clip.split.train if frame in seconds]
     if times:
         avatar.residuals.time_range.copy_(torch.tensor([min(times), max(times)]))
 
@@ -219,20 +156,19 @@ def architecture(settings: TrainSettings) -> Architecture:
     return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
 
 
-def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileTimer) -> None:
+def train(trainer: Trainer, context: Context, compiled: CompileTimer) -> None:
     """Runs the iterations that are left, with checkpoints and points of the curve."""
-    settings = trainer.settings
-    poses = inputs.all_poses
+    settings, clip, poses = trainer.settings, trainer.data.clip, trainer.data.poses
     key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
     resume(trainer, context.work, key, context)
-    shown = spread(inputs.split.test, settings.held_out_frames) if settings.held_out_frames else ()
+    shown = clip.spread(settings.held_out_frames, "test") if settings.held_out_frames else ()
     timer, first = TrainingTimer(context.work, trainer.iteration, compiled), trainer.iteration
-    watched = shown or spread(inputs.split.train, WATCHED)
+    watched = shown or clip.spread(WATCHED)
     if trainer.untrained is None:
         with timer.paused():
-            trainer.untrained = trainer.held_out(inputs.whole, watched)
-    with context.progress(settings.iterations, "training") as progress:
-        progress.advance(trainer.iteration)
+            trainer.untrained = trainer.held_out(watched)
+    with context.progress(settings.iterations, "training", step_costs(trainer)) as progress:
+        progress.skip(trainer.iteration)
         while trainer.iteration < settings.iterations:
             values = trainer.step()
             last = trainer.iteration == settings.iterations
@@ -240,7 +176,7 @@ def train(trainer: Trainer, inputs: Inputs, context: Context, compiled: CompileT
                 timer.mark(trainer.iteration)
                 trainer.require_finite()
                 with timer.paused():
-                    now = trainer.held_out(inputs.whole, watched)
+                    now = trainer.held_out(watched)
                 require_progress(trainer.untrained, now, trainer.iteration, settings)
                 held_out = now if shown else None
                 trainer.curve.point(trainer.iteration, point_values(trainer, held_out))
@@ -279,15 +215,3 @@ def report(iteration: int, values: dict[str, float], held_out: float | None, con
     """Logs the loss terms, and the held-out PSNR where there is one."""
     note = "" if held_out is None else f", held-out PSNR {held_out:.2f} dB"
     context.log(f"iteration {iteration}: {describe(values)}{note}")
-
-
-def _check(path: Path, poses: Poses, split: Split, cameras: set[int]) -> None:
-    missing = sorted({*split.train, *split.test} - set(poses.frames))
-    if missing:
-        raise UserError(f"{path} has no pose for frame {missing[0]}; run the fit stage again")
-    without = sorted(set(poses.frames) - cameras)
-    if without:
-        raise UserError(f"{path}: frame {without[0]} has no camera; run the ingest stage again")
-    for name in ("rotation", "expression", "transl"):
-        if not bool(torch.isfinite(getattr(poses, name)).all()):
-            raise UserError(f"{path} holds numbers that are not finite; run the fit stage again")

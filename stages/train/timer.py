@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.compiling import CompileTimer
+from pipeline.json_files import write_json
 
 NAME = "timer.json"
 
@@ -68,7 +69,7 @@ class TrainingTimer:
     def save(self, iteration: int) -> None:
         """Stores the marks beside a checkpoint that has just been written."""
         state = {"earlier": self.now(iteration), "marks": self.marks}
-        self._file.write_text(json.dumps(state), encoding="utf-8")
+        write_json(self._file, state)
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:

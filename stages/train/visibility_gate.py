@@ -29,12 +29,13 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.body import Pose
+from pipeline.clip import View, ViewCache
 from pipeline.device import moved
-from pipeline.records import write_json
+from pipeline.json_files import write_json
 from pipeline.tables import write_table
 from pipeline.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
-from stages.train.data import Frames, View
-from stages.train.poses import FramePose, PoseRefinement
+from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 
 SCHEMA = pa.schema(
@@ -88,7 +89,7 @@ class VisibilityGate(nn.Module):
         return self._avatar[0]
 
     @torch.no_grad()
-    def count(self, pose: FramePose, view: View) -> None:
+    def count(self, pose: Pose, view: View) -> None:
         """Counts one drawn frame and the vertices in its picture.
 
         Args:
@@ -96,7 +97,7 @@ class VisibilityGate(nn.Module):
             view: the frame.
         """
         source = GENERATED if view.generated else CAPTURED
-        self.hits[source] += body_in_frame(self.avatar.surfaces[0], pose.rotation, pose.transl, view.camera)
+        self.hits[source] += body_in_frame(self.avatar.surfaces[0], pose, view.camera)
         self.drawn[source] += 1
 
     def scores(self) -> Tensor:
@@ -168,7 +169,7 @@ class VisibilityGate(nn.Module):
         return self.whole_body(torch.maximum(captured, generated)), self.whole_body(self.avatar.active) == 1
 
 
-def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: tuple[int, ...]) -> Tensor:
+def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: ViewCache, frames: tuple[int, ...]) -> Tensor:
     """The body vertices that lie in the picture of at least one of the frames, [K] bool.
 
     Args:
@@ -179,9 +180,8 @@ def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: Frames, frames: 
     """
     seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
     for frame in frames:
-        pose = poses.fitted(frame)
         camera = moved(views.camera(frame), avatar.device)
-        seen |= body_in_frame(avatar.surfaces[0], pose.rotation, pose.transl, camera)
+        seen |= body_in_frame(avatar.surfaces[0], poses.fitted(frame), camera)
     return seen
 
 

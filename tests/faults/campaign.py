@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.stage import Progress
+from pipeline.run.progress import Progress
 from tests.faults.flips import damage_every_stage, unnoticed
 from tests.faults.observe import differences, litter, phase, published, wrongs
 from tests.faults.project import Project

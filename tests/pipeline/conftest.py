@@ -4,6 +4,7 @@ import sys
 
 import pytest
 
+from pipeline.config.request import parse_request
 from pipeline.workspace import REPOSITORY
 
 
@@ -30,6 +31,9 @@ class ToyProject:
     def words(self):
         return [f"data={self.data}", "stages=tests.pipeline.toy_stages"]
 
+    def request(self, *words):
+        return parse_request([*self.words(), *words])
+
     def doit(self, *words, command="run", options=()):
         line = [sys.executable, "-m", "doit", command, *options, *self.words(), *words]
         return subprocess.run(
@@ -37,7 +41,7 @@ class ToyProject:
         )
 
     def stage(self, name, subject, *words):
-        line = [sys.executable, "-m", "pipeline.stage", name, "--subject", subject, *self.words(), *words]
+        line = [sys.executable, "-m", "pipeline", name, "--subject", subject, *self.words(), *words]
         return subprocess.Popen(
             line,
             cwd=REPOSITORY,

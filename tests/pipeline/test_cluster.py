@@ -112,12 +112,16 @@ class FakeRay:
 
 def test_resources_come_from_the_preset_and_the_command_line(toy):
     (toy.data / "presets" / "quick.toml").write_text("[resources]\ncpus = 2\ngpus = 0.5\n")
-    words = {"data": str(toy.data), "stages": "tests.pipeline.toy_stages"}
-    assert resources_of(words) == Resources(2, 0.5)
-    assert resources_of({**words, "gpus": "0"}) == Resources(2, 0)
-    assert resources_of({**words, "preset": "balanced"}) == Resources(1, 0)
-    with pytest.raises(UserError, match="gpus=many"):
-        resources_of({**words, "gpus": "many"})
+
+    def given(*words):
+        return resources_of(toy.request(*words))
+
+    assert given() == Resources(2, 0.5)
+    assert given("gpus=0") == Resources(2, 0)
+    assert given("preset=balanced") == Resources(1, 0)
+    (toy.data / "presets" / "quick.toml").write_text("[resources]\ncpus = -1\n")
+    with pytest.raises(UserError, match=r"quick\.toml: resources\.cpus must be a number from 0"):
+        given()
 
 
 def test_a_batch_runs_what_doit_runs(toy):

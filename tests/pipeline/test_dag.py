@@ -107,7 +107,7 @@ def test_a_misspelt_name_is_an_error_that_shows_the_near_ones(toy):
 def test_a_value_that_does_not_fit_is_refused_before_anything_runs(toy):
     for word, hint in (
         ("paint.iterations=many", "whole number"),
-        ("paint.iterations=0", "at least 1"),
+        ("paint.iterations=0", "whole number from 1 to"),
         ("gather.upper=perhaps", "true or false"),
     ):
         run = toy.doit("subject=ann", word)

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from pipeline.compare import notes, table, wanted
 from pipeline.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
 from pipeline.errors import UserError
 from pipeline.protocols import Protocol
 from pipeline.settings import Layer
+from pipeline.studies.compare import comparison, wanted
 from pipeline.subjects import load_subject
 from pipeline.workspace import open_workspace
 
@@ -71,6 +71,12 @@ def test_an_unknown_dataset_is_one_line(many):
     assert run.returncode != 0 and 'says dataset = "pair"' in run.stderr and "Traceback" not in run.stderr
 
 
+def rows_of(text):
+    """First cell -> the others, of every row of a Markdown table but its rule."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
+    return {row[0]: row[1:] for row in rows if set(row[0]) - set(":-")}
+
+
 def test_compare_puts_published_rows_beside_ours(many):
     (many.data / "datasets" / "one.toml").write_text(
         'title = "One"\nprotocol = "on white"\n[paper]\ntable = "Table 9"\n'
@@ -84,12 +90,12 @@ def test_compare_puts_published_rows_beside_ours(many):
     (latest / "summary.json").write_text(text)
     run = many.doit("compare", "dataset=one")
     assert run.returncode == 0, run.stderr
-    assert (
-        "| Theirs (published) | 30.00 / 0.900 / 2.00 | 20.00 / 0.800 / 4.00 | 25.00 / 0.850 / 3.00 |"
-        in run.stdout
-    )
-    assert "| Others (published) | - | - | 31.00 / 0.950 / 1.50 |" in run.stdout
-    assert "| **here** (1 of 2 subjects) | 28.12 / 0.900 / 1.23 | - | 28.12 / 0.900 / 1.23 |" in run.stdout
+    assert rows_of(run.stdout) == {
+        "method": ["cat", "dog", "mean"],
+        "Theirs (published)": ["30.00 / 0.900 / 2.00", "20.00 / 0.800 / 4.00", "25.00 / 0.850 / 3.00"],
+        "Others (published)": ["-", "-", "31.00 / 0.950 / 1.50"],
+        "**here** (1 of 2 subjects)": ["28.12 / 0.900 / 1.23", "-", "28.12 / 0.900 / 1.23"],
+    }
     assert "on white" in run.stdout and "on black" in run.stdout and "Not run: dog" in run.stdout
     written = (many.store / "compare" / "one.md").read_text()
     assert written.strip() in run.stdout
@@ -99,25 +105,23 @@ def test_compare_puts_published_rows_beside_ours(many):
 def test_the_row_of_the_datasets_own_protocol_is_marked():
     means = {"avatar": {"psnr": 20.0, "ssim": 0.9, "lpips_alex": 0.1}}
     refined = {**means, "avatar_refined": {"psnr": 25.0, "ssim": 0.9, "lpips_alex": 0.1}}
-    found = {
-        "a": {"means": refined, "protocol": "white", "background": "white", "render_mask": "truth"},
-        "b": {"means": means, "protocol": "black", "background": "black", "render_mask": "own"},
-    }
+    white = {"protocol": "white", "background": "white", "render_mask": "truth", "current": True}
+    black = {"protocol": "black", "background": "black", "render_mask": "own", "current": False}
+    found = {"a": {"means": refined, **white}, "b": {"means": means, **black}}
     rows = (Row("T", {"b": (1.0, 2.0, 3.0)}),)
     as_neuman = Layer("x", {"evaluate": {"protocol": "paper"}})
-    about = Dataset("x", "X", "", "theirs", as_neuman, "", rows)
-    said = notes(about, {name: (one, True) for name, one in found.items()})
-    assert "The row to compare is 'here, test poses refined'" in said
-    assert "Not comparable, test poses were not refined: b" in said
-    assert "Not comparable, the published numbers are on white: b" in said
-    assert "Not comparable, the published numbers have the truth's mask on both pictures: b" in said
-    text = table(about, ["a", "b"], found, said)
-    assert "| **here, test poses refined** (1 of 2 subjects) | 25.00 / 0.900 / 10.00 | - |" in text
-    assert "| here | 20.00" in text
+    text = comparison(Dataset("x", "X", "", "theirs", as_neuman, "", rows), ["a", "b"], found)
+    shown = rows_of(text)
+    assert shown["**here, test poses refined** (1 of 2 subjects)"] == ["25.00 / 0.900 / 10.00", "-"] + [
+        "25.00 / 0.900 / 10.00"
+    ]
+    assert shown["here"][0].startswith("20.00") and shown["T (published)"][2] == "-"
+    remarks = [line for line in text.splitlines() if line.startswith("- ")]
+    assert len([line for line in remarks if "Not comparable" in line and line.endswith(": b")]) == 3
+    assert remarks[-1].startswith("- Under other settings") and remarks[-1].endswith(": b")
     plain = Dataset("x", "X", "", "theirs", Layer("x", {"evaluate": {"background": "black"}}), "", rows)
-    assert "| **here** | 20.00" in table(plain, ["a", "b"], found, [])
-    said = notes(plain, {"b": (found["b"], True)})
-    assert "The row to compare is 'here'" in said and not any("Not comparable" in one for one in said)
+    assert "**here**" in rows_of(comparison(plain, ["a", "b"], found))
+    assert "Not comparable" not in comparison(plain, ["b"], {"b": found["b"]})
 
 
 def test_neuman_is_judged_as_its_paper_does():
@@ -129,11 +133,15 @@ def test_neuman_is_judged_as_its_paper_does():
 
 def test_a_dataset_without_published_numbers_has_a_table_too():
     about = Dataset("x", "X", "", "", Layer("x", {}), "", ())
-    summary = {"means": {"avatar": {"psnr": 20.0, "ssim": None, "lpips_alex": None}}}
-    text = table(about, ["a", "b"], {"a": summary, "b": None}, [])
-    assert "| method | a | mean |" in text and "| 20.00 / - / - |" in text
+    means = {"avatar": {"psnr": 20.0, "ssim": None, "lpips_alex": None}}
+    found = {
+        "a": {"means": means, "protocol": "", "background": "black", "render_mask": "own", "current": True}
+    }
+    shown = rows_of(comparison(about, ["a", "b"], found))
+    assert shown["method"] == ["a", "mean"] and shown["**here** (1 of 2 subjects)"][0] == "20.00 / - / -"
     with_rows = Dataset("x", "X", "", "", Layer("x", {}), "", (Row("T", {"b": (1.0, 2.0, 3.0)}),))
-    assert "| method | a | b | mean |" in table(with_rows, ["a", "b"], {"a": summary}, [])
+    assert rows_of(comparison(with_rows, ["a", "b"], found))["method"] == ["a", "b", "mean"]
+    assert rows_of(comparison(with_rows, ["a", "b"], {}))["method"] == ["b", "mean"]
 
 
 def test_the_papers_datasets_are_complete():

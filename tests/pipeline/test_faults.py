@@ -10,10 +10,10 @@ import time
 
 import pytest
 
+from pipeline.__main__ import main
 from pipeline.artifact import LATEST, Store
 from pipeline.batch import run_subject
-from pipeline.job import job_from_words, run_stage
-from pipeline.stage import main
+from pipeline.job import open_job, run_stage
 from pipeline.verify import damages
 from pipeline.workspace import REPOSITORY
 from tests.faults.runs import alive
@@ -51,12 +51,8 @@ def hidden(toy, subject="ann"):
     return sorted(entry.name for entry in entries if not entry.name.startswith(".lock-"))
 
 
-def run_words(toy, *words):
-    return dict(word.split("=", 1) for word in (*toy.words(), *words))
-
-
 def make(toy, stage, *words):
-    return run_stage(job_from_words("ann", run_words(toy, *words)), stage)
+    return run_stage(open_job("ann", toy.request(*words)), stage)
 
 
 # Kills
@@ -106,10 +102,9 @@ def test_a_subject_that_the_system_kills_does_not_stop_the_others(toy):
 
 
 def test_a_batch_goes_on_without_a_subject_that_the_system_kills(toy):
-    words = {**run_words(toy), "bend.fail": "killed"}
-    outcome = run_subject("ann", words)  # what Ray runs, wherever it is put
+    outcome = run_subject("ann", toy.request("bend.fail=killed"))  # what Ray runs, wherever it is put
     assert outcome.stage == "bend" and "killed by signal 9 (SIGKILL)" in outcome.reason
-    assert run_subject("ann", run_words(toy)).stage == ""
+    assert run_subject("ann", toy.request()).stage == ""
     assert toy.ran() == ["gather:ann", "bend:ann", "bend:ann", "paint:ann"]
 
 

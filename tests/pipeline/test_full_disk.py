@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from pipeline.artifact import Store
 from pipeline.explain import explain, is_disk_full, size
 from pipeline.frames import write_png
-from pipeline.job import job_from_words, run_stage
+from pipeline.job import open_job, run_stage
 from pipeline.tables import write_table
 from pipeline.verify import damages
 
@@ -60,8 +60,7 @@ def read_only(folder):
 
 
 def make(toy, stage, *words):
-    pairs = dict(word.split("=", 1) for word in (*toy.words(), *words))
-    return run_stage(job_from_words("ann", pairs), stage)
+    return run_stage(open_job("ann", toy.request(*words)), stage)
 
 
 def fill(folder, pages_left):

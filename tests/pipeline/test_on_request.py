@@ -2,8 +2,9 @@
 
 import pytest
 
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import job_from_words, key_of, spelled_out
+from pipeline.job import key_of, open_job
 from pipeline.settings import as_dict
 from pipeline.stage import load_stages, usual
 
@@ -73,22 +74,20 @@ def test_clean_takes_its_results_too(toy):
 
 
 def test_a_short_word_is_its_stages_setting(toy):
-    stages = load_stages("tests.pipeline.toy_stages")
-    assert spelled_out({"tune": "la", "subject": "ann"}, stages) == {"sing.tune": "la", "subject": "ann"}
+    assert toy.request("tune=la").overrides == {"sing.tune": "la"}
     with pytest.raises(UserError, match="tune and sing.tune"):
-        spelled_out({"tune": "la", "sing.tune": "lu"}, stages)
+        toy.request("tune=la", "sing.tune=lu")
     run = toy.doit("sing", "subject=ann", "tun=la")
     assert run.returncode != 0 and "tune" in run.stderr.split("did you mean")[1]
 
 
 def test_keys_of_other_stages_do_not_know_of_loans(toy):
-    words = {"data": str(toy.data), "stages": "tests.pipeline.toy_stages"}
-    job = job_from_words("ann", {**words, "tune": "subject:bob"})
+    job = open_job("ann", toy.request("tune=subject:bob"))
     description = job.description("gather")
     assert "loans" not in description and as_dict(job.settings["sing"]) == {"tune": "subject:bob"}
-    assert key_of(description) == key_of(job_from_words("ann", words).description("gather"))
+    assert key_of(description) == key_of(open_job("ann", toy.request()).description("gather"))
 
 
 def test_a_motion_that_is_not_there_is_refused_before_anything_runs(toy):
     with pytest.raises(UserError, match=r"motion=nowhere.bvh: there is no such file.*subject:NAME"):
-        job_from_words("smile", {"motion": "nowhere.bvh"})
+        open_job("smile", parse_request(["motion=nowhere.bvh"]))

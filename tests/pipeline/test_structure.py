@@ -6,10 +6,11 @@ import sys
 
 import pytest
 
-from pipeline.job import job_from_words
+from pipeline.config.request import parse_request
+from pipeline.job import open_job
 from pipeline.stage import load_stages
 from pipeline.subjects import known_subjects
-from pipeline.workspace import REPOSITORY, open_workspace
+from pipeline.workspace import REPOSITORY
 
 
 def imports(path):
@@ -32,6 +33,13 @@ def test_pipeline_never_imports_stages():
         assert not [name for name in imports(path) if name.split(".")[0] == "stages"], path
 
 
+def test_only_the_dag_imports_studies():
+    for folder in ("pipeline", "stages", "benchmarks", "tools"):
+        for path in sources(folder):
+            others = [name for name in imports(path) if name.startswith("pipeline.studies")]
+            assert not others or path.parent.name == "studies", path
+
+
 def test_no_stage_imports_another():
     for path in sources("stages"):
         own = path.relative_to(REPOSITORY / "stages").parts[0]
@@ -45,7 +53,7 @@ def test_a_stage_is_declared_by_the_name_of_its_folder():
 
 
 def test_the_dag_loads_nothing_heavy():
-    heavy = ("torch", "numpy", "cv2", "numba", "pyarrow")
+    heavy = ("torch", "numpy", "cv2", "numba", "pyarrow", "scipy", "pandas", "matplotlib")
     code = f"import sys, dodo; print([name for name in {heavy} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
@@ -65,5 +73,6 @@ def test_files_stay_short(folder):
 
 def test_every_preset_and_subject_of_the_project_is_valid():
     for preset in sorted((REPOSITORY / "data" / "presets").glob("*.toml")):
-        for subject in known_subjects(open_workspace()):
-            assert set(job_from_words(subject, {"preset": preset.stem}).settings) == set(load_stages())
+        request = parse_request([f"preset={preset.stem}"])
+        for subject in known_subjects(request.workspace):
+            assert set(open_job(subject, request).settings) == set(load_stages())

@@ -9,13 +9,14 @@ import time
 import pytest
 
 from pipeline.artifact import Store
+from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import job_from_words
-from pipeline.studies.explore import seconds_of
-from pipeline.studies.knobs import CHANCE, knobs_of
-from pipeline.studies.notes import Notes
-from pipeline.studies.run import Failure, base_words, run_variants
-from pipeline.study import Outcome, Variant
+from pipeline.job import open_job
+from pipeline.studies.ablation import FULL, variants_of
+from pipeline.studies.measure import MeasurementCache
+from pipeline.studies.search import seconds_of
+from pipeline.studies.sweep import CHANCE, sweep_levels
+from pipeline.studies.variants import LEAN, Base, Variant, base_of
 from pipeline.workspace import REPOSITORY
 
 VARIANTS = (
@@ -29,32 +30,40 @@ def words_of(toy, **more):
     return {"data": str(toy.data), "stages": "tests.pipeline.toy_stages", **more}
 
 
-def run(toy, variants=VARIANTS, **more):
-    said = []
-    endings = run_variants("ann", variants, words_of(toy, **more), toy.root / "log.txt", say=said.append)
-    return endings, said
+def run(toy, variants=VARIANTS):
+    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
+    return [base.run(variant) for variant in variants]
 
 
 def test_what_variants_share_is_made_once_and_never_again(toy):
-    endings, said = run(toy)
+    results = run(toy)
     assert sorted(toy.ran()) == ["bend:ann"] * 2 + ["gather:ann"] + ["paint:ann"] * 3
-    assert [ending.variant for ending in endings] == ["base", "longer", "bent"] and len(said) == 3
-    assert endings[0].folders["bend"] == endings[1].folders["bend"] != endings[2].folders["bend"]
-    again, _ = run(toy)
+    assert [one.variant for one in results] == ["base", "longer", "bent"]
+    assert results[0].folders["bend"] == results[1].folders["bend"] != results[2].folders["bend"]
+    again = run(toy)
     assert toy.ran() == []
-    assert [ending.folders for ending in again] == [ending.folders for ending in endings]
-    assert all(set(ending.seconds) == {"gather", "bend", "paint"} for ending in again)
+    assert [one.folders for one in again] == [one.folders for one in results]
+    assert all(set(one.seconds) == {"gather", "bend", "paint"} for one in again)
+
+
+def test_what_is_missing_of_a_variant_is_known_before_it_is_made(toy):
+    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
+    assert base.missing("paint", {}) == ["gather", "bend", "paint"]
+    base.run(VARIANTS[0], ["bend"])
+    assert base.missing("paint", {}) == ["paint"] and base.missing("bend", {}) == []
+    assert base.missing("paint", VARIANTS[2].overrides) == ["bend", "paint"]
 
 
 def test_a_failing_variant_is_named_and_stops_no_other(toy):
     broken = Variant("broken", {"bend.fail": "user"})
     wrong = Variant("wrong", {"paint.iterations": "many"})
     crashed = Variant("crashed", {"bend.fail": "bug"})
-    endings, said = run(toy, (VARIANTS[0], broken, wrong, crashed, VARIANTS[2]))
-    assert [type(ending) for ending in endings] == [Outcome, Failure, Failure, Failure, Outcome]
-    assert "clip.mp4: is not a clip; name another" in endings[1].reason
-    assert "whole number" in endings[2].reason and "ZeroDivisionError" in endings[3].reason
-    assert "broken: failed" in said[1]
+    results = run(toy, (VARIANTS[0], broken, wrong, crashed, VARIANTS[2]))
+    assert [bool(one.failure) for one in results] == [False, True, True, True, False]
+    assert "clip.mp4: is not a clip; name another" in results[1].failure
+    assert "paint.iterations" in results[2].failure and "ZeroDivisionError" in results[3].failure
+    assert "broken" in results[1].line and "is not a clip" in results[1].line
+    assert not results[1].folders and not results[1].held_out()
 
 
 def test_what_was_in_use_stays_in_use(toy):
@@ -68,11 +77,12 @@ def test_what_was_in_use_stays_in_use(toy):
 STUDY = """
 import sys
 from pathlib import Path
-from pipeline.studies.run import run_variants
-from pipeline.study import Variant
+from pipeline.config.request import parse_request
+from pipeline.studies.variants import Base, Variant
 data, log = sys.argv[1:]
 words = {"data": data, "stages": "tests.pipeline.toy_stages", "paint.iterations": "40", "paint.rate": "0.05"}
-run_variants("ann", [Variant("one"), Variant("two", {"bend.angle": "2"})], words, Path(log))
+base = Base("ann", parse_request(words), Path(log))
+assert not any(base.run(one).failure for one in (Variant("one"), Variant("two", {"bend.angle": "2"})))
 """
 
 
@@ -96,46 +106,69 @@ def test_a_study_killed_outright_goes_on_where_it_was(toy):
     assert began[0] == 0 and began[1] > 0 and began[2] == 0
 
 
-def test_words_of_a_study_are_the_command_lines_on_top_of_its_scale(toy):
+def test_a_base_is_the_command_line_on_top_of_its_scale(toy):
+    def own(subject, words):
+        return base_of(subject, parse_request(words), toy.root / "log.txt").request.overrides
+
     words = {"subject": "smile", "budget": "3m", "scale": "small", "train.subdivisions": "1"}
-    own = base_words("smile", words)
-    assert own["train.subdivisions"] == "1" and own["train.iterations"] == "200"
-    assert own["train.held_out_every"] == "40" and own["evaluate.turntable_frames"] == "2"
-    assert not {"subject", "budget", "scale"} & set(own)
-    assert (
-        base_words("smile", {**words, "evaluate.turntable_frames": "9"})["evaluate.turntable_frames"] == "9"
-    )
-    assert base_words("ann", words_of(toy)) == words_of(toy)  # stages without such settings
-    assert "dataset" not in base_words("smile", {"dataset": "samples"})
-    assert base_words("smile", {"subject": "smile", "dataset": "samples"})["dataset"] == "samples"
+    found = own("smile", words)
+    assert found["train.subdivisions"] == "1" and found["train.iterations"] == "200"
+    assert 200 // int(found["train.held_out_every"]) >= 5 and found["evaluate.turntable_frames"] == "2"
+    assert {f"evaluate.{name}" for name in LEAN} <= set(found)
+    assert own("smile", {**words, "evaluate.turntable_frames": "9"})["evaluate.turntable_frames"] == "9"
+    assert own("ann", words_of(toy)) == {}  # stages without such settings
     with pytest.raises(UserError, match="scale=huge"):
-        base_words("smile", {"scale": "huge"})
+        own("smile", {"scale": "huge"})
+
+
+def test_a_base_knows_the_preset_that_it_is_and_takes_another(toy):
+    def base(**words):
+        return base_of("smile", parse_request(words), toy.root / "log.txt")
+
+    assert base().preset == "quick" and base(preset="draft").preset == "draft"
+    assert base(**{"evaluate.turntable_frames": "9"}).preset == "quick"
+    assert base(scale="small").preset == base(**{"train.lpips": "0"}).preset == ""
+    own = base(**{"train.iterations": "7", "artifacts": str(toy.store)})
+    other = own.under_preset("paper")
+    assert other.settings["train"] == open_job("smile", parse_request({"preset": "paper"})).settings["train"]
+    assert other.request.workspace == own.request.workspace
 
 
 @pytest.mark.parametrize("subject", ["smile", "mannequin_head"])
 @pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_every_level_of_every_knob_can_be_set_and_changes_something(subject, preset):
-    base = job_from_words(subject, {"preset": preset})
-    knobs = knobs_of(base.settings)
+def test_every_level_can_be_set_and_changes_something(subject, preset):
+    base = open_job(subject, parse_request({"preset": preset}, subject))
+    levels = sweep_levels(base.settings)
+    parameters = [level.parameter for level in levels]
     assert {"iterations", "number of Gaussians", "image size", "fit effort", "precision", "LPIPS"} <= {
-        knob.name for knob in knobs
+        *parameters
     }
-    assert [knob.name for knob in knobs if not knob.combines] == [CHANCE]
-    for knob in knobs:
-        assert not knob.levels[0].words
-        for level in knob.levels[1:]:
-            changed = job_from_words(subject, {"preset": preset, **level.words})
-            assert changed.settings != base.settings, level.label
-            assert level.factor > 0
+    assert parameters.count(CHANCE) == 1
+    firsts = len(dict.fromkeys(parameters))
+    assert len(set(parameters[:firsts])) == firsts  # each parameter's first level before any second one
+    for level in levels:
+        changed = open_job(subject, parse_request({"preset": preset, **dict(level.overrides)}, subject))
+        assert changed.settings != base.settings, level.label
+        assert level.factor > 0
+
+
+def test_every_part_of_the_method_can_be_left_out(tmp_path):
+    base = base_of("smile", parse_request({}), tmp_path / "log.txt", {"auxiliary.generator": "auto"})
+    for key, variant in variants_of(base).items():
+        assert (base.job(variant.overrides).settings == base.settings) == (key == FULL)
+
+
+def levels_of(parameter, subject="smile", **words):
+    levels = sweep_levels(open_job(subject, parse_request(words, subject)).settings)
+    return [level for level in levels if level.parameter == parameter]
 
 
 @pytest.mark.parametrize(
-    ("subject", "words"),
+    ("subject", "overrides"),
     [("smile", {"ingest.long_side": "256"}), ("mannequin_head", {"ingest.mannequin_size": "128"})],
 )
-def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
-    knobs = {knob.name: knob for knob in knobs_of(job_from_words(subject, {}).settings)}
-    assert knobs["image size"].levels[1].words == words  # long_side does nothing to what is filmed here
+def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, overrides):
+    assert dict(levels_of("image size", subject)[0].overrides) == overrides
 
 
 @pytest.mark.parametrize(
@@ -147,12 +180,18 @@ def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, words):
         ({"train.subdivisions": "0"}, "no subdivision", "12"),
     ],
 )
-def test_the_number_of_gaussians_is_turned_whatever_the_plan_says(words, own, others):
-    settings = job_from_words("smile", words).settings
-    levels = {knob.name: knob for knob in knobs_of(settings)}["number of Gaussians"].levels
-    assert levels[0].label == own and not levels[0].words
-    assert "".join(level.words["train.subdivisions"] for level in levels[1:]) == others
-    assert all(level.words["plan.subdivision"] == "on" for level in levels[1:])
+def test_the_number_of_gaussians_is_varied_whatever_the_plan_says(words, own, others):
+    levels = levels_of("number of Gaussians", **words)
+    assert {level.before for level in levels} == {own}
+    assert "".join(dict(level.overrides)["train.subdivisions"] for level in levels) == others
+    assert all(dict(level.overrides)["plan.subdivision"] == "on" for level in levels)
+
+
+def test_a_part_is_left_out_where_it_is_and_added_where_it_can_be():
+    on, off = (levels_of("LPIPS", **{"train.lpips": weight})[0] for weight in ("0.1", "0"))
+    assert dict(on.overrides) == {"train.lpips": "0"} and on.factor < 1 < off.factor
+    assert float(dict(off.overrides)["train.lpips"]) > 0
+    assert levels_of("visibility gate") and not levels_of("visibility gate", **{"train.gate": "false"})
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("20m", 1200), ("1.5h", 5400), ("45", 45)])
@@ -166,17 +205,17 @@ def test_no_budgets(text):
         seconds_of(text)
 
 
-def test_what_was_noted_is_not_measured_again(tmp_path):
-    notes, asked = Notes(tmp_path / "notes"), []
+def test_what_is_in_the_cache_is_not_measured_again(tmp_path):
+    cache, asked = MeasurementCache(tmp_path / "measured"), []
 
     def measure():
         asked.append(1)
         return {"ms": 2.5, "unknown": float("nan")}
 
-    assert notes.once("a", measure) == notes.once("a", measure) == {"ms": 2.5}
+    assert cache.get("a", measure) == cache.get("a", measure) == {"ms": 2.5}
     assert len(asked) == 1
-    (tmp_path / "notes" / "a.json").write_text("{")  # cut off
-    assert notes.once("a", measure) == {"ms": 2.5} and len(asked) == 2
+    (tmp_path / "measured" / "a.json").write_text("{")  # cut off
+    assert cache.get("a", measure) == {"ms": 2.5} and len(asked) == 2
 
 
 def test_the_dag_refuses_what_a_study_cannot_be_told(toy):

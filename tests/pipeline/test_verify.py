@@ -142,4 +142,4 @@ def test_a_flipped_bit_in_an_upstream_record_does_not_mislead_about_what_follows
 
 def test_verify_takes_true_or_false(toy):
     run = toy.doit("subject=ann", "verify=perhaps")
-    assert run.returncode != 0 and "verify=perhaps: it must be true or false" in run.stderr
+    assert run.returncode != 0 and "verify must be true or false, not perhaps" in run.stderr

@@ -16,16 +16,18 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.body import Poses, skin, uniform_laplacian, vertex_normals
+from pipeline.body import Poses, linear_blend_skinning, uniform_laplacian, vertex_normals
 from pipeline.camera import facing_camera, project
+from pipeline.composite import composite_frame
 from pipeline.guard import finite
-from pipeline.metrics import composite, interior, psnr, ssim
+from pipeline.metrics import interior, psnr, ssim, ssim_loss
+from pipeline.metrics.ssim import plain_ssim_loss
 from pipeline.splat import Gaussians, render
 from pipeline.visibility import LARGEST_LOSS, evidence_threshold, histogram, otsu_threshold, share_below
 from stages.fit import terms
-from stages.fit.doubt import exchanged, nonsense
 from stages.fit.initialise import continuous
 from stages.fit.observations import drop_guesses, visible
+from stages.fit.outlier_frames import isolated_outliers, left_right_swapped
 from stages.fit.parameters import orthonormalised
 from stages.fit.smoothing import nearest_branch, smooth
 from stages.fit.windows import bumps, windows
@@ -167,7 +169,7 @@ def skinning_stays_among_where_the_joints_put_a_point(weights, points, turns):
     share = tensor(weights) + 1e-6
     share = share / share.sum(1, keepdim=True)
     transforms = torch.cat([roma.rotvec_to_rotmat(tensor(turns)), tensor(turns)[..., None]], -1)
-    found = skin(transforms[None], share, tensor(points))[0]
+    found = linear_blend_skinning(transforms[None], share, tensor(points))[0]
     each = torch.einsum("jab,nb->nja", transforms[..., :3], tensor(points)) + transforms[..., 3]
     slack = 1e-4 * (1 + each.abs().max())
     assert ((found >= each.amin(1) - slack) & (found <= each.amax(1) + slack)).all()
@@ -236,7 +238,7 @@ def scores_are_symmetric_and_bounded(pair):
 def image_losses_are_finite_with_finite_slopes(pair):
     image, truth = map(tensor, pair)
     leaf = image.requires_grad_()
-    fused, plain = losses.ssim(leaf, truth), losses.plain_ssim(leaf, truth)
+    fused, plain = ssim_loss(leaf, truth), plain_ssim_loss(leaf, truth)
     assert abs(float((fused - plain).detach())) < 2e-3
     (losses.l1(leaf, truth) + fused + plain).backward()
     assert leaf.grad.isfinite().all()
@@ -266,7 +268,7 @@ def regularisers_are_not_negative_and_have_finite_slopes(offset, log_scale):
 @property_of(hnp.arrays(np.uint8, (8, 6, 3)), hnp.arrays(np.uint8, (8, 6)), st.integers(0, 9))
 def a_composite_and_its_interior_lie_in_the_picture(frame, mask, erosion):
     for background in ("black", "white"):
-        image = composite(frame, mask, background)
+        image = composite_frame(frame, mask, background)
         assert image.min() >= 0 and image.max() <= 1 + 1e-6
     assert not (interior(mask, erosion).numpy() & (mask <= 127)).any()
 
@@ -327,12 +329,12 @@ def guesses_are_only_taken_away(mask):
         )
     )
 )
-def doubt_never_takes_most_of_a_clip(clip):
+def outlier_frames_are_never_most_of_a_clip(clip):
     left, right, gaps = clip
     frames = np.cumsum(gaps).astype(np.int64)
-    rows = exchanged(frames, left, right)
+    rows = left_right_swapped(frames, left, right)
     assert len(rows) <= len(frames) / 2 and (np.diff(rows) > 0).all()
-    assert set(nonsense(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
+    assert set(isolated_outliers(frames, left, right)) <= set(range(1, max(1, len(frames) - 1)))
 
 
 # Masks, splits and draws

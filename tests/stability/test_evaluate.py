@@ -42,22 +42,22 @@ def assert_published(output):
     walk(summary_of(output))
 
 
-def invisible(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def invisible(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, opacities=torch.zeros(40))
 
 
-def nobody(rotation, expression, transl, time):
-    return stand_in(rotation, expression, transl, time).select(torch.zeros(0, dtype=torch.long))
+def nobody(pose, time):
+    return stand_in(pose, time).select(torch.zeros(0, dtype=torch.long))
 
 
-def broken(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def broken(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, means=seen.means * math.nan)
 
 
-def enormous(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def enormous(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, scales=seen.scales * 1e12, means=seen.means * 1e9)
 
 

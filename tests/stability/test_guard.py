@@ -13,11 +13,11 @@ from pipeline import guard
 from pipeline.artifact import Store
 from pipeline.body import Poses, write_poses
 from pipeline.errors import UserError
+from pipeline.explain import explain
 from pipeline.guard import NotFiniteError, finite, require_finite, require_finite_files
-from pipeline.records import write_json
-from pipeline.stage import explain
+from pipeline.json_files import write_json
 from pipeline.tables import write_table
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 BAD = [math.nan, math.inf, -math.inf]
 KEY = "0123456789abcdef"

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from pipeline.metrics import PSNR_CAP, Lpips, dissimilarity, interior, psnr, ssim
+from pipeline.metrics import PSNR_CAP, Lpips, interior, psnr, ssim, ssim_loss
 from pipeline.metrics.identity import identity_cosine
+from pipeline.metrics.ssim import plain_ssim_loss
 from stages.train import losses
 from stages.train.perceptual import crop
 
@@ -32,7 +33,7 @@ def test_every_pair_has_finite_scores_and_slopes(pair):
     image, truth = PAIRS[pair]
     assert math.isfinite(psnr(image, truth)) and psnr(image, truth) <= PSNR_CAP
     assert -1.0001 <= ssim(image, truth) <= 1 + 1e-9
-    for loss in (losses.l1, losses.ssim, losses.plain_ssim, dissimilarity):
+    for loss in (losses.l1, ssim_loss, plain_ssim_loss):
         leaf = image.clone().requires_grad_()
         value = loss(leaf, truth)
         value.backward()
@@ -44,7 +45,7 @@ def test_identical_images_score_best_and_pull_nowhere(pair):
     image, truth = PAIRS[pair]
     assert psnr(image, truth) == PSNR_CAP and ssim(image, truth) == pytest.approx(1, abs=1e-9)
     leaf = image.clone().requires_grad_()
-    value = losses.ssim(leaf, truth)
+    value = ssim_loss(leaf, truth)
     value.backward()
     # A tap of float32's window rounds: the loss of a flat image is off by 3e-5, its slope by nothing.
     assert abs(float(value.detach())) < 1e-4 and leaf.grad.abs().max() < 1e-6
@@ -57,7 +58,7 @@ def test_the_score_is_that_of_double_precision_where_single_is_not_enough(pair):
     batches = [one.double().permute(2, 0, 1)[None] for one in (image, truth)]
     exact = float(structural_similarity_index_measure(*batches, data_range=1.0))
     assert ssim(image, truth) == pytest.approx(exact, abs=1e-9)
-    assert float(losses.ssim(image, truth)) == pytest.approx(1 - exact, abs=5e-3)
+    assert float(ssim_loss(image, truth)) == pytest.approx(1 - exact, abs=5e-3)
 
 
 @pytest.mark.parametrize("size", SMALL)
@@ -65,7 +66,7 @@ def test_crops_smaller_than_the_window_have_scores_and_slopes(size):
     image, truth = torch.rand(*size, 3, generator=GENERATOR), torch.rand(*size, 3, generator=GENERATOR)
     assert -1 <= ssim(image, truth) < 1
     leaf = image.clone().requires_grad_()
-    value = dissimilarity(leaf, truth)
+    value = ssim_loss(leaf, truth)
     value.backward()
     assert leaf.grad.isfinite().all()
     assert float(value) == pytest.approx(1 - ssim(image, truth), abs=1e-4)
@@ -76,7 +77,7 @@ def test_an_image_that_is_not_finite_shows_in_the_losses(value):
     """The kernels' fast arithmetic must not hide it."""
     image = NOISE.clone()
     image[5, 7, 1] = value
-    for loss in (losses.l1, losses.ssim, losses.plain_ssim, dissimilarity):
+    for loss in (losses.l1, ssim_loss, plain_ssim_loss):
         assert not loss(image, NOISE).isfinite(), loss.__name__
 
 

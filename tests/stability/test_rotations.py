@@ -13,7 +13,6 @@ from pipeline.body import Poses, joint_index, joint_transforms, load_body, mean_
 from stages.fit.initialise import continuous, shortest_turn
 from stages.fit.parameters import parameters_of
 from stages.fit.smoothing import nearest_branch, smooth
-from stages.fit.solver.state import between
 from tests.stages.train_subject import BODY_FILE
 
 AXES = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (-0.48, 0.6, 0.64)]
@@ -196,16 +195,6 @@ def test_continuous_and_nearest_branch_keep_the_rotation():
         assert found.isfinite().all()
         same = roma.rotvec_to_rotmat(rotation.double())
         torch.testing.assert_close(roma.rotvec_to_rotmat(found.double()), same, rtol=0, atol=1e-5)
-
-
-def test_the_way_between_opposite_rotations_is_a_rotation():
-    rotation = torch.zeros(2, 55, 3)
-    rotation[1, :, 1] = math.pi
-    found = between(
-        parameters_of(rotation, torch.zeros(2, 3), (1, 1, 1)), torch.tensor([0, 4]), torch.arange(5.0)
-    )
-    away = found.matrices @ found.matrices.mT - torch.eye(3)
-    assert found.matrices.isfinite().all() and away.abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,14 @@ from pipeline.avatar.canonical import build_canonical
 from pipeline.avatar.posing import plain_normals, plain_place
 from pipeline.body import (
     Identity,
+    Pose,
     joint_transforms,
+    linear_blend_skinning,
     load_body,
     mean_identity,
     pose_body,
     rest_joints,
     rest_vertices,
-    skin,
     uniform_laplacian,
     vertex_normals,
 )
@@ -107,13 +108,13 @@ def test_weights_that_nearly_sum_to_one_are_divided_by_their_sum(tmp_path):
 
 
 def test_weights_that_do_not_sum_to_one_scale_about_the_origin_and_stay_finite(body):
-    """``skin`` itself takes any weights: a sum of 0.5 draws a point half-way to the world's origin."""
+    """Skinning itself takes any weights: a sum of 0.5 draws a point half-way to the world's origin."""
     joints = rest_joints(body, mean_identity(body))
     transforms = joint_transforms(random_pose(0.5, 1), joints, body.parents)
-    whole = skin(transforms, body.skinning_weights, body.v_template)
-    half = skin(transforms, 0.5 * body.skinning_weights, body.v_template)
+    whole = linear_blend_skinning(transforms, body.skinning_weights, body.v_template)
+    half = linear_blend_skinning(transforms, 0.5 * body.skinning_weights, body.v_template)
     torch.testing.assert_close(half, 0.5 * whole)
-    assert not skin(transforms, 0 * body.skinning_weights, body.v_template).any()
+    assert not linear_blend_skinning(transforms, 0 * body.skinning_weights, body.v_template).any()
 
 
 def test_subdivided_weights_still_sum_to_one(body):
@@ -160,12 +161,18 @@ def test_a_body_without_extent_is_posed_and_drawn(body):
         plane_resolution=4, plane_channels=2, subdivisions=0, width=16, groups=4, residual_width=16
     )
     avatar = Avatar(flat, mean_identity(flat), torch.arange(len(flat.v_template)), bare).eval()
-    gaussians = avatar.gaussians(torch.zeros(55, 3), torch.zeros(1), torch.tensor([0.0, 0, -2.0]))
+    gaussians = avatar.gaussians(before_the_camera(torch.zeros(55, 3)))
     image = render(gaussians, facing_camera(32, 32, 40.0)).color
     assert image.isfinite().all()
 
 
 # The avatar
+
+
+def before_the_camera(rotation):
+    """A pose [55, 3] two metres before a camera at the origin."""
+    return Pose(rotation, torch.zeros(1), torch.tensor([0.0, 0, -2.0]))
+
 
 SMALL = Architecture(
     plane_resolution=8, plane_channels=4, subdivisions=1, width=16, groups=4, residual_width=16
@@ -176,7 +183,7 @@ SMALL = Architecture(
 def test_an_avatar_of_a_few_points_decodes_poses_and_learns(body, kept):
     """GroupNorm over one row, a triplane's box without extent, vertices without neighbours."""
     avatar = Avatar(body, mean_identity(body), torch.tensor(kept), SMALL, half_precision=False).train()
-    posed = avatar.pose(avatar.decode(), random_pose(0.3, 1)[0], torch.zeros(1), torch.tensor([0.0, 0, -2.0]))
+    posed = avatar.pose(avatar.decode(), before_the_camera(random_pose(0.3, 1)[0]))
     assert all(tensor.isfinite().all() for tensor in posed.gaussians.tensors())
     sum(tensor.square().sum() for tensor in posed.gaussians.tensors()).backward()
     assert all(one.grad is None or one.grad.isfinite().all() for one in avatar.parameters())
@@ -208,7 +215,7 @@ def test_scales_and_colours_of_extreme_heads_stay_in_their_ranges(body, value):
     with torch.no_grad():
         avatar.geometry.last.bias[3:] = value
         avatar.color.last.bias[:] = value
-    posed = avatar.pose(avatar.decode(0), torch.zeros(55, 3), torch.zeros(1), torch.tensor([0.0, 0, -2.0]))
+    posed = avatar.pose(avatar.decode(0), before_the_camera(torch.zeros(55, 3)))
     gaussians = posed.gaussians
     assert gaussians.scales.isfinite().all() and 0 < gaussians.scales.min() <= gaussians.scales.max() <= 0.03
     assert ((gaussians.colors >= 0) & (gaussians.colors <= 1)).all()

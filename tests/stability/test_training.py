@@ -12,7 +12,7 @@ from pipeline.body import load_body
 from pipeline.errors import UserError
 from pipeline.frames import frame_path, write_frame, write_mask
 from pipeline.guard import NotFiniteError
-from stages.train import losses, schedule
+from stages.train import losses, objective, schedule
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, read_checkpoint
 from stages.train.divergence import require_progress
@@ -71,8 +71,7 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
     clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
     steps(trainer, 8)
     steps(clean, 8)
-    inputs = stage.read_inputs(context_for(subject, tmp_path / "unused"))
-    scores = [one.held_out(inputs.whole, inputs.split.test) for one in (trainer, clean)]
+    scores = [one.held_out(clean.data.clip.split.test) for one in (trainer, clean)]
     assert scores[0] > scores[1] - 6
 
 
@@ -176,7 +175,7 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
 
 def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
     trainer = trainer_for(context_for(subject, tmp_path / "out", batch=2))
-    monkeypatch.setattr(losses, "ssim", lambda image, target: losses.l1(image, target) * float("nan"))
+    monkeypatch.setattr(objective, "ssim_loss", lambda image, target: losses.l1(image, target) * float("nan"))
     with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d;"):
         trainer.step()
 
@@ -212,8 +211,7 @@ def drift(subject, tmp_path, count, **settings):
     """The loss of every step, and the held-out PSNR at the end."""
     trainer = trainer_for(context_for(subject, tmp_path, iterations=count, **settings))
     taken = steps(trainer, count)
-    inputs = stage.read_inputs(context_for(subject, tmp_path))
-    return np.array(taken), trainer.held_out(inputs.whole, inputs.split.test)
+    return np.array(taken), trainer.held_out(trainer.data.clip.split.test)
 
 
 def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):

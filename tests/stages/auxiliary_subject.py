@@ -17,7 +17,7 @@ from pipeline.keypoints import write_keypoints
 from pipeline.plan import write_plan
 from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
 from stages.auxiliary.settings import AuxiliarySettings
-from stages.auxiliary.turn import read_clip
+from stages.auxiliary.turn import read_numbered_clip
 from stages.ingest.mannequin.appearance import make_appearance
 from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.footage import Mannequin, make_mannequin
@@ -67,7 +67,7 @@ def write_clip(folder: Path, framing: str = "full", size: int = 96) -> Path:
 
 
 def read(folder: Path):
-    return read_clip(folder / "ingest", folder / "fit", BODY_FILE)
+    return read_numbered_clip(folder / "ingest", folder / "fit", BODY_FILE)
 
 
 def context_for(place: Path, output: Path, assets=(), **changes):

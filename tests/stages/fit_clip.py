@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from pipeline.body import (
+    BodyModel,
     Landmarks,
     Poses,
     joint_index,
@@ -20,6 +21,12 @@ from pipeline.body import (
 )
 from pipeline.camera import Camera, facing_camera, project
 from pipeline.keypoints import Keypoints, empty_keypoints
+from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initialise import initial_parameters
+from stages.fit.objective import Objective
+from stages.fit.observations import observe
+from stages.fit.parameters import Parameters, landmark_model, movable_joints
+from stages.fit.registration import frozen_groups, views_of
 from stages.fit.settings import FitSettings
 
 BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
@@ -29,7 +36,7 @@ QUICK = FitSettings(iterations=100)
 
 
 @dataclasses.dataclass(frozen=True)
-class Clip:
+class DetectedClip:
     """Detections, and the poses and joints [T, 55, 3] behind them."""
 
     keypoints: Keypoints
@@ -58,7 +65,7 @@ def true_poses(frames: tuple[int, ...], distance: float = 3.0) -> Poses:
     return Poses(frames, rotation, torch.zeros(count, 1), transl)
 
 
-def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> Clip:
+def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> DetectedClip:
     """The clip; the hands are never detected, the face only if asked for."""
     frames = tuple(range(3, 3 + gap * count, gap))
     poses = true_poses(frames)
@@ -80,10 +87,10 @@ def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bo
         pose_world=np.concatenate([world.numpy(), np.ones((count, 33, 1), np.float32)], -1),
         face_mesh=seen(landmarks.face_mesh) if face else blank.face_mesh,
     )
-    return Clip(keypoints, dict.fromkeys(frames, camera), poses, joints)
+    return DetectedClip(keypoints, dict.fromkeys(frames, camera), poses, joints)
 
 
-def whole_body(clip: Clip, body, landmarks: Landmarks) -> Clip:
+def whole_body(clip: DetectedClip, body, landmarks: Landmarks) -> DetectedClip:
     """The same clip as the 133 points alone, as an mmpose file gives them."""
     vertices, joints = pose_body(
         body, mean_identity(body), clip.poses.rotation, clip.poses.expression, clip.poses.transl
@@ -93,3 +100,21 @@ def whole_body(clip: Clip, body, landmarks: Landmarks) -> Clip:
     blank = empty_keypoints(clip.keypoints.frames)
     points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1).numpy()
     return dataclasses.replace(clip, keypoints=dataclasses.replace(blank, whole_body=points))
+
+
+def problem_of(
+    model: tuple[BodyModel, Landmarks], clip: DetectedClip, betas: int = 4
+) -> tuple[Objective, Parameters, frozenset[str]]:
+    """Objective, initial parameters and frozen groups, as the registration makes them without a face."""
+    body, landmarks = model
+    settings = FitSettings(face="off", betas=betas)
+    views = views_of(clip.keypoints, clip.cameras)
+    seen = observe(clip.keypoints, landmarks, settings.score_threshold, views.size.numpy())
+    on_face = seen.of("face") & on_skin(body, seen.points)
+    spread = spread_matrix(body, seen.points[on_face])
+    found = landmark_model(body, seen.points, settings.betas, spread)
+    initial = initial_parameters(clip.keypoints, seen, found, views)
+    movable = movable_joints(found, seen.mask.any(0), seen.vague)
+    objective = Objective(body, seen, found, views, initial, movable, settings)
+    frozen = frozen_groups(settings, face_is_seen=bool((seen.mask.any(0) & on_face).any()))
+    return objective, initial, frozen

@@ -1,6 +1,5 @@
 """The auxiliary stage: guidance, the texture, the crop, folders of others, and when nothing is made."""
 
-import dataclasses
 import json
 import shutil
 
@@ -9,7 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import joint_index, pose_body, read_poses, rest_joints, vertex_normals
+from pipeline.body import (
+    joint_index,
+    pose_body,
+    pose_frame,
+    posed_vertices,
+    read_poses,
+    rest_joints,
+    vertex_normals,
+)
 from pipeline.camera import project
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_video
@@ -19,7 +26,6 @@ from pipeline.records import read_cameras
 from pipeline.texture import Seen, robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary import texture
-from stages.auxiliary.accept import posed
 from stages.auxiliary.crop import find_framing
 from stages.auxiliary.folder import read_folder
 from stages.auxiliary.publish import NOTHING_NEW
@@ -65,7 +71,7 @@ def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
     pelvis = rest_joints(clip.body, clip.identity)[0]
     headings = []
     for row in range(8):
-        vertices, joints = posed(clip, turn.poses, row)
+        vertices, joints = pose_frame(clip.body, clip.identity, turn.poses.pose(row))
         pixels = project(turn.camera, vertices)
         assert bool((pixels >= 0).all()) and bool((pixels < torch.tensor([144.0, 256.0])).all())
         assert torch.allclose(joints[0], pelvis + turn.poses.transl[row], atol=1e-5)
@@ -179,11 +185,11 @@ def test_an_unseen_back_is_shaded_as_the_light_says():
 
 def test_projected_colours_are_those_of_the_frames(full):
     """The textured body in a frame of the clip looks like that frame."""
-    clip, context = read(full), context_for(full, full / "projected")
+    clip = read(full)
     surface = texture.fine_surface(clip.body, 1)
-    seen = texture.gather(clip, surface, clip.train[:3], context)
+    seen = texture.gather(surface, clip, clip.split.train[:3])
     colors = texture.complete(surface, seen)
-    frame = clip.train[1]
+    frame = clip.split.train[1]
     image, mask, _ = texture.paint(clip.cameras[frame], surface, clip.vertices(frame), colors)
     truth, inside = read_frame(clip.folder / "frames", frame), (mask > 250)
     inside &= cv2.erode(read_mask(clip.folder / "masks", frame), np.ones((5, 5), np.uint8)) > 250
@@ -214,8 +220,8 @@ def test_the_result_is_whole_and_its_numbers_are_their_own(painted):
 def test_the_camera_of_a_crop_sees_the_person_where_the_picture_has_it(full, painted):
     clip, output = read(full), painted.output
     poses, cameras = read_poses(output / "poses.parquet"), read_cameras(output / "cameras.parquet")
-    for row, frame in enumerate(poses.frames):
-        vertices = posed(clip, poses, row)[0]
+    for frame in poses.frames:
+        vertices = posed_vertices(clip.body, clip.identity, poses.pose(frame))
         pixels = project(cameras[frame], vertices).floor().long()
         inside = (pixels >= 0).all(1) & (pixels[:, 0] < cameras[frame].width)
         inside &= pixels[:, 1] < cameras[frame].height
@@ -346,9 +352,10 @@ def test_the_peers_generated_folder(full, painted, tmp_path):
     (theirs / "frame_list_train.txt").write_text("100001\n100005\n")
     offer = read_folder(theirs, clip, turn, BODY_FILE)
     assert [picture.frame for picture in offer.pictures] == [1, 5] == list(offer.poses.frames)
-    for row, frame in enumerate(offer.poses.frames):
-        there = project(offer.cameras[frame], posed(clip, offer.poses, row)[0])
-        here = project(turn.camera, posed(clip, turn.poses, frame)[0])
+    person = clip.body, clip.identity
+    for frame in offer.poses.frames:
+        there = project(offer.cameras[frame], posed_vertices(*person, offer.poses.pose(frame)))
+        here = project(turn.camera, posed_vertices(*person, turn.poses.pose(frame)))
         assert torch.allclose(there, here, atol=0.05)
 
 
@@ -362,13 +369,3 @@ def test_what_cannot_be_read_is_named(full, tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"no video")
     with pytest.raises(UserError, match="cannot be read as a video"):
         read_folder(tmp_path / "v.mp4", clip, turn, BODY_FILE)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"generator": "magic"}, {"generator": "folder"}, {"generator": "mimicmotion"}, {"frames": 3},
-     {"overlap": 71}, {"motion": "dance"}, {"flicker": 0.0}, {"texture_levels": 3}],
-)  # fmt: skip
-def test_settings_that_cannot_work_are_refused(changes):
-    with pytest.raises(ValueError, match="auxiliary"):
-        dataclasses.replace(AuxiliarySettings(), **changes)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import PARTS, part_labels, rasterize
+from pipeline.body import PARTS, part_labels, posed_vertices, rasterize
 from pipeline.frames import write_frame
 from stages.auxiliary import check
 from stages.auxiliary import run as stage
 from stages.auxiliary.look import Look
 from stages.auxiliary.register import MIRRORED, register
 from stages.auxiliary.skeleton import turn_keypoints
-from stages.auxiliary.turn import make_turn, posed_vertices
+from stages.auxiliary.turn import make_turn
 from tests.stages.auxiliary_subject import body_and_landmarks, context_for, films, read, write_clip
 
 FRAMES, SIZE = 8, (360, 640)
@@ -92,7 +92,7 @@ def test_shuffled_frames_are_refused_and_those_in_their_place_kept(own, judged):
 
 def without_arm(clip, turn, row, image):
     """A frame whose left arm is painted over with what is beside it."""
-    vertices = posed_vertices(clip.body, clip.identity, turn.poses, row)
+    vertices = posed_vertices(clip.body, clip.identity, turn.poses.pose(row))
     raster = rasterize(turn.camera, vertices, clip.body.faces)
     labels = part_labels(clip.body).numpy()[clip.body.faces[:, 0].numpy()]
     parts = np.where(raster.covered, labels[np.maximum(raster.face, 0)], -1)

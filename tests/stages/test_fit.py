@@ -2,11 +2,13 @@
 
 import contextlib
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import roma
 import torch
 import trimesh
 
@@ -15,10 +17,11 @@ from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask
 from pipeline.keypoints import write_keypoints
 from pipeline.records import Footage, write_cameras, write_footage
+from stages.fit.adam import optimise
 from stages.fit.registration import register
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
-from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER, QUICK, SIZE, load, make_clip, whole_body
+from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER, QUICK, SIZE, load, make_clip, problem_of, whole_body
 
 LEFT_ARM = ("left_shoulder", "left_elbow", "left_wrist")
 
@@ -107,6 +110,20 @@ def test_equal_input_gives_equal_parameters(model, masked):
     assert torch.equal(first.poses.rotation, second.poses.rotation)
     assert torch.equal(first.poses.transl, second.poses.transl)
     assert torch.equal(first.identity.face_offset, second.identity.face_offset)
+
+
+def test_body_seen_from_behind_turns_through_pi(model, clip):
+    """Root rotations of the start lie on both sides of pi; matrices have no seam there."""
+    objective, initial, frozen = problem_of(model, clip)
+    away = torch.zeros(6, 55, 3)
+    away[:, 0, 1] = torch.linspace(-0.05, 0.05, 6)
+    flip = roma.rotvec_to_rotmat(torch.tensor([0.0, math.pi, 0.0])) @ roma.rotvec_to_rotmat(away)
+    matrices = initial.matrices.clone()
+    matrices[:, 0] = flip[:, 0] @ matrices[:, 0]
+    found = optimise(objective, initial.with_matrices(matrices), 30, frozen)
+    for value in found.named().values():
+        assert torch.isfinite(value).all()
+    assert roma.rotmat_geodesic_distance(found.matrices[1:, 0], found.matrices[:-1, 0]).max() < 0.5
 
 
 @pytest.mark.parametrize("count", [1, 2])

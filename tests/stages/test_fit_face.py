@@ -9,7 +9,7 @@ import roma
 import torch
 
 from pipeline.keypoints import empty_keypoints
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit import terms
 from stages.fit.face import fit_face
 from stages.fit.face.mesh import densest_half, face_from_mesh

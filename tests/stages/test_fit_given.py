@@ -21,6 +21,7 @@ from pipeline.pose_files import (
     write_record,
 )
 from pipeline.stage import Context
+from stages.fit.initial_poses import given_identity
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest
@@ -179,10 +180,8 @@ def test_records_come_back_and_damaged_ones_are_named(tmp_path, ingested):
 
 def test_mean_identity_stands_for_a_missing_shape(shown, ingested):
     record = with_flat_hands(read_record(ingested / RECORD), BODY_FILE, False)
-    from stages.fit.pose_given import _identity
-
     bare = dataclasses.replace(record, betas=None, joint_offset=None, face_offset=None)
-    found, mean = _identity(bare, shown.body, "nothing"), mean_identity(shown.body)
+    found, mean = given_identity(bare, shown.body, "nothing"), mean_identity(shown.body)
     assert torch.equal(found.betas, mean.betas) and torch.equal(found.face_offset, mean.face_offset)
     with pytest.raises(UserError, match="vertices"):
-        _identity(dataclasses.replace(record, face_offset=torch.zeros(10_475, 3)), shown.body, "nothing")
+        given_identity(dataclasses.replace(record, face_offset=torch.zeros(10_475, 3)), shown.body, "nothing")

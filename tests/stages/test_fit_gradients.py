@@ -6,10 +6,10 @@ import pytest
 import roma
 import torch
 
-from pipeline.body import load_body, matrix_transforms
+from pipeline.body import forward_kinematics, load_body
 from stages.fit import terms
+from stages.fit.joint_limits import joint_limits
 from stages.fit.parameters import parameters_of
-from stages.fit.ranges import joint_ranges
 from tests.stages.fit_clip import BODY_FILE
 
 T, N = 3, 4
@@ -40,7 +40,7 @@ CASES = {
         x, random(T, N, 3, seed=1), torch.nn.functional.normalize(random(T, N, 3, seed=2), dim=-1)
     ),
     "in_front_loss": lambda x: terms.in_front_loss(x[..., 2], x[:, 0, 0], 0.2),
-    "range_loss": lambda x: terms.range_loss(
+    "joint_limit_loss": lambda x: terms.joint_limit_loss(
         x, torch.full((3,), -0.5).double(), torch.full((3,), 0.4).double()
     ),
     "velocity": lambda x: terms.velocity(x, TIMES),
@@ -63,7 +63,7 @@ def test_gradient_of_six_numbers_a_rotation():
     weights = random(55, 3, 4, seed=3)
 
     def posed(columns):
-        transforms, moved = matrix_transforms(roma.special_gramschmidt(columns), joints, body.parents)
+        transforms, moved = forward_kinematics(roma.special_gramschmidt(columns), joints, body.parents)
         return (transforms * weights).sum((1, 2, 3)), (moved * weights[..., 0]).sum((1, 2))
 
     assert torch.autograd.gradcheck(posed, (six,))
@@ -92,9 +92,9 @@ def test_priors_stay_finite_where_a_limited_joint_turns_by_pi():
     rotation[0, :, 1] = math.pi
     rotation[1, :, 2] = math.pi - 1e-6
     parameters = parameters_of(rotation, torch.zeros(2, 3), (1, 1, 0)).leaves()
-    ranges = joint_ranges()
+    limits = joint_limits()
     vectors = roma.rotmat_to_rotvec(parameters.matrices)
-    loss = terms.range_loss(ranges.of(vectors), ranges.low, ranges.high).sum() + vectors.square().sum()
+    loss = terms.joint_limit_loss(limits.of(vectors), limits.low, limits.high).sum() + vectors.square().sum()
     loss.backward()
     assert torch.isfinite(loss)
     assert torch.isfinite(parameters.hands.grad).all()

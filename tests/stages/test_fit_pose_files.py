@@ -14,20 +14,20 @@ from pipeline.body import (
     Poses,
     joint_index,
     joint_transforms,
+    linear_blend_skinning,
     pose_body,
     posed_joints,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.camera import facing_camera, to_camera
 from pipeline.keypoints import empty_keypoints
 from pipeline.pose_files import read_hand_mean, read_initial_poses, tool_joints, write_peer_files
 from pipeline.pose_files.coefficients import is_official_smplx
 from stages.fit.face_offset import on_skin, spread_matrix
+from stages.fit.initial_poses import initial_from_files
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model
-from stages.fit.pose_start import initial_from_files
 from stages.fit.registration import views_of
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
 
@@ -117,7 +117,7 @@ def as_the_tools_pose(folder, body, hand_mean, name="smplx_params"):
     assert not loaded(fitted / "locator_offset.json").any()
     moved = torch.einsum("vce,te->tvc", body.expression_directions, expression[:, :38])
     transforms = joint_transforms(rotation, joints, body.parents)
-    vertices = skin(transforms, body.skinning_weights, rest + moved)
+    vertices = linear_blend_skinning(transforms, body.skinning_weights, rest + moved)
     trans = columns["trans"][:, None]
     return vertices + trans, posed_joints(rotation, joints, body.parents) + trans
 

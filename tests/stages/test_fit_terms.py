@@ -11,15 +11,14 @@ import torch
 from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
 from pipeline.guard import NotFiniteError
 from stages.fit import terms
+from stages.fit.adam import rate
 from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix
 from stages.fit.finite import finite_sum
 from stages.fit.initialise import continuous, torso_orientation
+from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import drop_guesses, observe, visible
-from stages.fit.optimise import rate
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
-from stages.fit.ranges import joint_ranges
 from stages.fit.registration import views_of
-from stages.fit.settings import FitSettings
 from stages.fit.windows import bumps
 from tests.stages.fit_clip import BODY_FILE, load, make_clip
 
@@ -75,8 +74,8 @@ def test_in_front_loss():
     assert terms.in_front_loss(depth, chest, 0.25)[0].tolist() == pytest.approx([0.15**2, 0.0, 0.0], abs=1e-6)
 
 
-def test_range_loss():
-    loss = terms.range_loss(torch.tensor([-0.5, 0.5, 2.0]), torch.zeros(3), torch.ones(3))
+def test_joint_limit_loss():
+    loss = terms.joint_limit_loss(torch.tensor([-0.5, 0.5, 2.0]), torch.zeros(3), torch.ones(3))
     assert loss.tolist() == [0.25, 0.0, 1.0]
 
 
@@ -216,9 +215,9 @@ def test_mirror_matrix():
     assert mirror_matrix(torch.zeros(0, 3)).shape == (0, 0)
 
 
-def test_ranges_are_mirrored_and_hold_a_relaxed_hand():
-    ranges = joint_ranges()
-    rows = {(int(j), int(a)): k for k, (j, a) in enumerate(zip(ranges.joint, ranges.axis, strict=True))}
+def test_joint_limits_are_mirrored_and_hold_a_relaxed_hand():
+    limits = joint_limits()
+    rows = {(int(j), int(a)): k for k, (j, a) in enumerate(zip(limits.joint, limits.axis, strict=True))}
     for name in ("index2", "elbow", "wrist"):
         for axis in range(3):
             left = rows.get((joint_index(f"left_{name}"), axis))
@@ -226,23 +225,23 @@ def test_ranges_are_mirrored_and_hold_a_relaxed_hand():
             if left is None:
                 assert right is None
             elif axis == 0:
-                assert ranges.low[left] == ranges.low[right]
+                assert limits.low[left] == limits.low[right]
             else:
-                assert ranges.low[left] == -ranges.high[right]
-    assert ((ranges.low <= 0) & (ranges.high >= 0)).all()
+                assert limits.low[left] == -limits.high[right]
+    assert ((limits.low <= 0) & (limits.high >= 0)).all()
 
 
 def test_knees_and_fingers_bend_the_possible_way(model):
-    """What the ranges allow moves a foot back, a hand forward, a fingertip to the palm."""
+    """What the limits allow moves a foot back, a hand forward, a fingertip to the palm."""
     body = model[0]
     joints = body.joint_regressor @ body.v_template
     cases = (("left_knee", 0, 1.0, "left_ankle", 2, -1), ("right_elbow", 1, 1.0, "right_wrist", 2, 1))
     cases += (("left_index1", 2, -1.0, "left_index3", 1, -1), ("right_index1", 2, 1.0, "right_index3", 1, -1))
-    ranges = joint_ranges()
+    limits = joint_limits()
     for name, axis, angle, end, along, sign in cases:
         rotation = torch.zeros(1, 55, 3)
         rotation[0, joint_index(name), axis] = angle
-        outside = terms.range_loss(ranges.of(rotation), ranges.low, ranges.high)
+        outside = terms.joint_limit_loss(limits.of(rotation), limits.low, limits.high)
         assert outside.sum() == 0, name
         transforms = joint_transforms(rotation, joints, body.parents)[0, joint_index(end)]
         moved = transforms[:, :3] @ joints[joint_index(end)] + transforms[:, 3] - joints[joint_index(end)]
@@ -289,11 +288,3 @@ def test_rate_is_coarse_to_fine():
 def test_loss_that_is_not_finite_is_named():
     with pytest.raises(NotFiniteError, match="step 7: smooth"):
         finite_sum({"keypoints": torch.ones(()), "smooth": torch.tensor(math.nan)}, 7)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("iterations", -1), ("betas", 0), ("smoothness", -1.0), ("score_threshold", 1.5)]
-)
-def test_settings_refuse_what_cannot_work(name, value):
-    with pytest.raises(ValueError, match=f"fit.{name} must"):
-        FitSettings(**{name: value})

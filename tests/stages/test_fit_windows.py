@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from pipeline.body import joint_index
+from stages.fit.adam import gradients
 from stages.fit.objective import Objective
 from stages.fit.observations import observe
-from stages.fit.optimise import gradients
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.registration import register, views_of
 from stages.fit.settings import FitSettings

@@ -21,7 +21,7 @@ from pipeline.frames import read_frame, read_mask
 from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import RECORD, read_record, with_flat_hands
 from pipeline.records import read_cameras, read_footage, read_split
-from stages.fit.pose_given import keep_given
+from stages.fit.initial_poses import keep_given
 from stages.fit.views import stack
 from stages.ingest.datasets.neuman import official_split
 from stages.ingest.datasets.recording import STEP

@@ -133,8 +133,6 @@ def test_what_is_no_dataset_is_said(tmp_path):
         open_recording(tmp_path, IngestSettings())
     with pytest.raises(UserError, match="does not exist"):
         open_recording(tmp_path / "gone", IngestSettings())
-    with pytest.raises(ValueError, match=r"ingest\.layout must be auto"):
-        IngestSettings(layout="neumann")
     for name in LAYOUTS:
         with pytest.raises(UserError):
             open_recording(tmp_path, IngestSettings(layout=name))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.job import job_from_words
+from pipeline.config.request import parse_request
+from pipeline.job import open_job
 from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import RECORD
 from pipeline.records import read_cameras, read_footage, read_split
@@ -85,8 +86,9 @@ def test_oliver_is_a_talkshow_clip_without_shows_file(tmp_path, assets_folder, s
     clip = shared_folder / "data" / "oliver" / "video.mp4"
     if not clip.is_file():
         pytest.skip("the clip is not there")
-    job = job_from_words(
-        "oliver", {"source": str(clip), "ingest.max_frames": "40", "ingest.long_side": "256"}
+    job = open_job(
+        "oliver",
+        parse_request({"source": str(clip), "ingest.max_frames": "40", "ingest.long_side": "256"}, "oliver"),
     )
     settings = job.settings["ingest"]
     assert settings.layout == "talkshow" and settings.test_frames == 30  # from the dataset's file

@@ -268,7 +268,7 @@ def test_seen_vertices_face_the_camera(clips):
     "wrong", [{"framing": "feet"}, {"motion": "fly"}, {"frames": 1}, {"views": ("below",)}, {"noise": -1.0}]
 )
 def test_specs_are_checked(wrong):
-    with pytest.raises(ValueError, match="mannequin"):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         MannequinSpec(**wrong)
 
 

@@ -7,20 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import load_body
 from pipeline.camera import facing_camera
+from pipeline.clip import read_fitted_clip
 from pipeline.errors import UserError
+from pipeline.json_files import write_json
 from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
-from pipeline.person import WINDOW
 from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
-from pipeline.records import Split, read_footage, write_footage, write_json, write_split
+from pipeline.records import Split, read_footage, write_footage, write_split
 from pipeline.settings import command_line_layer, resolve
 from pipeline.tables import write_table
 from stages.ingest.cameras.motion import MOVING
 from stages.plan import decide, measure
 from stages.plan.run import run
 from stages.plan.settings import PlanSettings
-from stages.train import losses
 from tests.stages.train_subject import BODY_FILE, FRAMES, write_subject
 
 AZIMUTH_CASES = [
@@ -83,7 +82,7 @@ def test_a_head_calls_for_what_a_head_has(clip):
     ("pixels", "levels"), [(0.0, 0), (0.7, 0), (1.5, 0), (1.6, 1), (3.0, 1), (3.1, 2), (6.1, 3)]
 )
 def test_gaussians_are_as_fine_as_the_pixels(clip, monkeypatch, pixels, levels):
-    monkeypatch.setattr(decide, "gaussian_pixels", lambda clip: pixels)
+    monkeypatch.setattr(decide, "gaussian_pixels", lambda inputs: pixels)
     made = planned(clip)["subdivision"]
     assert made.on == (levels > 0) and made.values == (levels,) and made.measured == pixels
 
@@ -103,7 +102,7 @@ def test_pixels_between_vertices_are_those_of_a_known_grid():
 
 
 def test_a_picture_of_half_the_size_halves_the_pixels_between_vertices(clip):
-    whole = measure.read_clip(clip / "ingest", clip / "fit", measure_body())
+    whole = measure.read_inputs(clip / "ingest", clip / "fit", BODY_FILE)
     half = {frame: one.resized(one.width // 2, one.height // 2) for frame, one in whole.cameras.items()}
     ratio = measure.gaussian_pixels(whole) / measure.gaussian_pixels(dataclasses.replace(whole, cameras=half))
     assert ratio == pytest.approx(2, rel=0.02)
@@ -159,24 +158,17 @@ def test_one_training_frame_gives_a_plan(clip):
     assert len(plan["auxiliary_views"].values) == 11
 
 
-@pytest.mark.parametrize("setting", [{"pose_heads": "maybe"}, {"seen_torso": ""}])
-def test_other_words_are_refused(setting):
-    with pytest.raises(ValueError, match="auto, on, off"):
-        PlanSettings(**setting)
-
-
 def test_there_is_a_setting_for_each_decision():
     assert {field.name for field in dataclasses.fields(PlanSettings)} == {*DECIDED, *SEEN_PARTS}
 
 
 def test_numbers_that_stand_in_two_places_agree():
     assert decide.BACKGROUND_MOTION == MOVING
-    assert losses.WINDOW == WINDOW
 
 
 @pytest.mark.parametrize(("degrees", "widest", "count"), AZIMUTH_CASES)
 def test_azimuths_that_no_frame_shows(clip, degrees, widest, count):
-    whole = measure.read_clip(clip / "ingest", clip / "fit", measure_body())
+    whole = read_fitted_clip(clip / "ingest", clip / "fit", BODY_FILE)
     poses = whole.poses
     rotation = poses.rotation[:1].repeat(max(1, len(degrees)), 1, 1)
     for row, angle in enumerate(degrees):  # the body turned away by an angle is seen from minus that
@@ -196,10 +188,6 @@ def test_azimuths_that_no_frame_shows(clip, degrees, widest, count):
     assert (found, len(unseen)) == (widest, count)
     for angle in degrees:
         assert (30.0 * round(angle / 30)) % 360 not in unseen
-
-
-def measure_body():
-    return load_body(BODY_FILE)
 
 
 @pytest.mark.parametrize("name", ["fit/face.json", "fit/residuals.parquet", "ingest/keypoints.parquet"])

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 
@@ -10,12 +9,12 @@ from pipeline import curves
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
+from pipeline.clip import read_fitted_clip
 from pipeline.errors import UserError
-from pipeline.frames import write_mask
 from pipeline.plan import read_plan
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import losses
+from stages.train import losses, objective
 from stages.train import run as stage
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
@@ -45,12 +44,12 @@ def finished(subject):
 
 
 def trainer_for(context) -> Trainer:
-    inputs = stage.read_inputs(context)
+    data = stage.read_training_data(context)
     settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
-    refinement = stage.PoseRefinement(inputs.poses, inputs.split.train)
-    avatar, texture = stage.prepare(inputs, refinement, settings, context)
-    gate = VisibilityGate(avatar, len(inputs.body.v_template), settings) if settings.gate else None
-    return Trainer(avatar, refinement, inputs.evidence(texture), settings, gate=gate)
+    refinement = stage.PoseRefinement(data.clip.poses, data.clip.split.train)
+    avatar, data = stage.prepare(data, refinement, settings, context)
+    gate = VisibilityGate(avatar, len(data.clip.body.v_template), settings) if settings.gate else None
+    return Trainer(avatar, refinement, data, settings, gate=gate)
 
 
 def bytes_of(folder) -> dict[str, bytes]:
@@ -146,21 +145,22 @@ def test_training_comes_closer_to_the_training_frames(subject, tmp_path):
         learning_rate=1e-2,
         warm_up=1,
     )
-    inputs, trainer = stage.read_inputs(context), trainer_for(context)
-    before = trainer.held_out(inputs.whole, inputs.split.train)
+    trainer = trainer_for(context)
+    frames = trainer.data.clip.split.train
+    before = trainer.held_out(frames)
     assert trainer.level == 0
     while trainer.iteration < 15:
         trainer.step()
     assert trainer.level == 1
-    assert trainer.held_out(inputs.whole, inputs.split.train) > before + 3
+    assert trainer.held_out(frames) > before + 3
 
 
 def test_initial_colors_are_near_the_truth(subject, tmp_path):
     context = context_for(subject, tmp_path / "out")
-    inputs, trainer = stage.read_inputs(context), trainer_for(context)
+    trainer = trainer_for(context)
     grey = trainer_for(context_for(subject, tmp_path / "grey", initial_color=False))
-    frames = inputs.split.test
-    assert trainer.held_out(inputs.whole, frames) > grey.held_out(inputs.whole, frames) + 5
+    frames = trainer.data.clip.split.test
+    assert trainer.held_out(frames) > grey.held_out(frames) + 5
 
 
 def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
@@ -194,11 +194,10 @@ def test_only_drawn_frames_move(subject, tmp_path):
 def test_published_avatar_renders_the_held_out_frame(subject, finished):
     body = load_body(BODY_FILE)
     avatar = load_avatar(finished / "avatar.safetensors", body)
-    inputs = stage.read_inputs(context_for(subject, finished.with_name("unused")))
-    view = inputs.whole[5]
+    clip = read_fitted_clip(subject / "ingest", subject / "fit", body)
+    view = clip.view(5)
     with torch.no_grad():
-        pose = inputs.poses
-        gaussians = avatar.gaussians(pose.rotation[5], pose.expression[5], pose.transl[5], inputs.times[5])
+        gaussians = avatar.gaussians(clip.pose(5), clip.seconds[5])
         rendering = render(gaussians, view.camera)
     error = (rendering.color - view.composite(torch.zeros(3))).square().mean()
     curve_rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")
@@ -233,7 +232,7 @@ def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_
         calls.append(1)
         return losses.l1(image, target) * (float("nan") if len(calls) == 3 else 1)
 
-    monkeypatch.setattr(losses, "ssim", poisoned)
+    monkeypatch.setattr(objective, "ssim_loss", poisoned)
     with pytest.raises(UserError, match="loss term 'ssim' is nan at iteration 2"):
         stage.run(context)
     assert not list(context.output.iterdir())
@@ -283,24 +282,6 @@ def test_poses_that_cannot_be_used_say_what_to_do(subject, tmp_path, change, mes
     with pytest.raises(UserError, match=message) as caught:
         stage.run(altered(subject, tmp_path / "altered", change))
     assert "fit" in str(caught.value)
-
-
-def test_masks_without_anybody_say_so(subject, tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame in range(3):
-        write_mask(tmp_path / "masks", frame, np.zeros((64, 48), np.uint8))
-    with pytest.raises(UserError, match="nobody"):
-        stage.person_box(tmp_path, (0, 1, 2), 8)
-
-
-def test_person_box_holds_every_mask_and_stays_in_the_frame(tmp_path):
-    (tmp_path / "masks").mkdir()
-    for frame, column in enumerate((3, 30)):
-        mask = np.zeros((64, 48), np.uint8)
-        mask[20:60, column : column + 10] = 255
-        write_mask(tmp_path / "masks", frame, mask)
-    box = stage.person_box(tmp_path, (0, 1), 8)
-    assert (box.left, box.top, box.right, box.bottom) == (0, 12, 48, 64)
 
 
 def test_resumed_run_takes_up_the_skinning_weights_where_they_were(subject, tmp_path):

@@ -1,15 +1,17 @@
 """Training off the CPU: with plain torch in the kernels' place, and on a pretended device. No GPU is here."""
 
+import importlib
+
 import pytest
 import torch
 
 from pipeline import curves
 from pipeline.avatar import heads, load_avatar, posing
-from pipeline.body import load_body
+from pipeline.body import Pose, load_body
 from pipeline.device import moved
 from pipeline.splat import render
 from pipeline.tables import read_table
-from stages.train import initial_colors, loop, losses, objective, visibility_gate
+from stages.train import initial_colors, loop, objective, visibility_gate
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 from tests.stages.train_subject import BODY_FILE, context_for, write_subject
@@ -32,22 +34,21 @@ def subject(tmp_path_factory):
 
 
 def without_kernels(monkeypatch):
-    for module in (posing, heads, losses):
+    for module in (posing, heads, importlib.import_module("pipeline.metrics.ssim")):
         monkeypatch.setattr(module, "kernels_serve", lambda tensor: False)
 
 
 def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
     """The loss terms of some steps, and the gradients of the last one."""
     context = context_for(subject, output, **ALL_ON)
-    inputs = stage.read_inputs(context)
-    refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
-    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
+    data = stage.read_training_data(context)
+    refinement = stage.PoseRefinement(data.poses, data.clip.split.train)
+    avatar, data = stage.prepare(data, refinement, context.settings, context)
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    scored = visibility_gate.VisibilityGate(avatar, len(inputs.body.v_template), context.settings)
-    evidence = inputs.evidence(texture)
-    trainer = stage.Trainer(avatar, refinement, evidence, context.settings, gate=scored)
+    scored = visibility_gate.VisibilityGate(avatar, len(data.clip.body.v_template), context.settings)
+    trainer = stage.Trainer(avatar, refinement, data, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]
     named = {**dict(avatar.named_parameters()), **dict(refinement.named_parameters())}
     return values, {name: one.grad for name, one in named.items() if one.grad is not None}
@@ -101,9 +102,9 @@ def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_
     avatars = [load_avatar(one.output / "avatar.safetensors", load_body(BODY_FILE)) for one in (here, there)]
     assert all(tensor.device.type == "cpu" for tensor in avatars[1].state_dict().values())
     assert torch.equal(avatars[0].active, avatars[1].active)
-    still = torch.zeros(55, 3), torch.zeros(5), torch.zeros(3)
+    still = Pose(torch.zeros(55, 3), torch.zeros(5), torch.zeros(3))
     with torch.no_grad():
-        colors = [avatar.gaussians(*still).colors for avatar in avatars]
+        colors = [avatar.gaussians(still).colors for avatar in avatars]
     torch.testing.assert_close(*colors, rtol=0, atol=0.03)
 
 

@@ -10,10 +10,11 @@ from pipeline.body import Poses, read_poses, write_poses
 from pipeline.camera import Camera
 from pipeline.errors import UserError
 from pipeline.frames import write_frame, write_mask
-from pipeline.records import read_cameras, write_cameras, write_json
+from pipeline.json_files import write_json
+from pipeline.records import read_cameras, write_cameras
 from pipeline.tables import read_table
 from stages.train import run as stage
-from stages.train.generated import BothFrames, read_generated
+from stages.train.generated import GeneratedFrames, read_generated
 from stages.train.visibility_gate import SCHEMA
 from tests.stages.train_subject import context_for, write_subject
 
@@ -62,21 +63,20 @@ def inputs_of(subject, output, **changes):
 
 def objective_of(subject, output, **changes):
     context = inputs_of(subject, output, **changes)
-    inputs = stage.read_inputs(context)
-    refinement = stage.PoseRefinement(inputs.all_poses, inputs.split.train)
-    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
-    evidence = inputs.evidence(texture)
-    return stage.Trainer(avatar, refinement, evidence, context.settings, None, None).objective
+    data = stage.read_training_data(context)
+    refinement = stage.PoseRefinement(data.poses, data.clip.split.train)
+    avatar, data = stage.prepare(data, refinement, context.settings, context)
+    return stage.Trainer(avatar, refinement, data, context.settings, None, None).objective
 
 
 def test_frames_have_their_own_size_camera_and_trust(subject, tmp_path):
-    inputs = stage.read_inputs(inputs_of(subject, tmp_path / "out"))
-    view = inputs.views[FIRST]
+    data = stage.read_training_data(inputs_of(subject, tmp_path / "out"))
+    view = data.view(FIRST)
     assert view.generated and view.color.shape == (48, 36, 3) and view.camera.width == 36
     assert view.trust is not None and bool((view.trust == 1).all())
-    captured = inputs.views[0]
+    captured = data.view(0)
     assert not captured.generated and captured.trust is None and captured.color.shape != view.color.shape
-    assert inputs.views.camera(FIRST).width == 36
+    assert data.sources == (tuple(range(5)), (FIRST, FIRST + 1, FIRST + 2))
 
 
 def test_poses_of_generated_frames_never_move(objective):
@@ -91,13 +91,13 @@ def test_poses_of_generated_frames_never_move(objective):
 def test_what_is_not_trusted_costs_nothing(objective, monkeypatch):
     position = next(k for k in range(20) if objective.draw(k).frame >= FIRST)
     trusted = objective(position, 0, False)
-    read = BothFrames.__getitem__
+    read = GeneratedFrames.view
 
-    def doubted(views, frame):
-        view = read(views, frame)
+    def doubted(generated, frame):
+        view = read(generated, frame)
         return dataclasses.replace(view, trust=torch.zeros_like(view.alpha))
 
-    monkeypatch.setattr(BothFrames, "__getitem__", doubted)
+    monkeypatch.setattr(GeneratedFrames, "view", doubted)
     untrusted = objective(position, 0, False)
     assert trusted["l1"].item() > 0.01 and untrusted["l1"].item() == pytest.approx(0, abs=1e-7)
     assert untrusted["ssim"].item() == pytest.approx(0, abs=1e-5)

@@ -1,6 +1,5 @@
 """The objective on the tiny synthetic subject: which term moves what, and how draws add up."""
 
-import copy
 import dataclasses
 
 import pytest
@@ -8,8 +7,11 @@ import torch
 from torch import nn
 
 from pipeline.avatar import Avatar
+from pipeline.clip import ViewCache
+from pipeline.records import Split
 from stages.train import run as stage
-from stages.train.objective import Evidence, Objective
+from stages.train.data import TrainingData
+from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from tests.stages.train_subject import context_for, write_subject
@@ -35,32 +37,45 @@ def subject(tmp_path_factory):
 
 
 @dataclasses.dataclass(frozen=True)
+class SaidToBeGenerated:
+    """Captured frames that pass for generated ones."""
+
+    captured: ViewCache
+    frames: tuple[int, ...]
+
+    def view(self, frame):
+        return dataclasses.replace(self.captured[frame], generated=True)
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
-    """An awakened avatar, every part of it active, and its evidence."""
+    """An awakened avatar, every part of it active, and what it is compared with."""
 
     settings: TrainSettings
     avatar: Avatar
     poses: PoseRefinement
-    evidence: Evidence
+    data: TrainingData
 
     def objective(self, generated=(), **changes) -> Objective:
-        views = copy.copy(self.evidence.views)
-        views.generated = frozenset(generated)
-        evidence = dataclasses.replace(self.evidence, views=views)
+        learnt, data = self.data.clip.split.train, self.data
+        made = SaidToBeGenerated(data.crops, tuple(frame for frame in learnt if frame in generated))
+        captured = Split(tuple(frame for frame in learnt if frame not in generated), ())
+        clip = dataclasses.replace(data.clip, split=captured)
         settings = dataclasses.replace(self.settings, **changes)
-        return Objective(self.avatar, self.poses, evidence, settings, Brightness())
+        data = dataclasses.replace(data, clip=clip, generated=made)
+        return Objective(self.avatar, self.poses, data, settings, Brightness())
 
 
 def scene(subject, output, **changes) -> Scene:
     context = context_for(subject, output, **{**ALL_ON, **changes})
-    inputs = stage.read_inputs(context)
-    refinement = PoseRefinement(inputs.poses, inputs.split.train)
-    avatar, texture = stage.prepare(inputs, refinement, context.settings, context)
+    data = stage.read_training_data(context)
+    refinement = PoseRefinement(data.poses, data.clip.split.train)
+    avatar, data = stage.prepare(data, refinement, context.settings, context)
     avatar.pose_heads_active = avatar.residuals_active = True
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    return Scene(context.settings, avatar, refinement, inputs.evidence(texture))
+    return Scene(context.settings, avatar, refinement, data)
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +170,7 @@ def test_residual_heads_are_sometimes_told_no_time(objective):
     made = objective(time_dropout=0.25)
     times = [made.draw(position).time for position in range(400)]
     assert 60 < sum(time is None for time in times) < 140
-    assert {time for time in times if time is not None} == {made.evidence.times[f] for f in range(5)}
+    assert {time for time in times if time is not None} == {made.data.clip.seconds[f] for f in range(5)}
     always = objective(time_dropout=0.0)
     assert all(always.draw(position).time is not None for position in range(50))
 
@@ -197,8 +212,8 @@ def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject):
 
 def test_term_that_lacks_what_it_needs_is_refused(objective):
     made = objective()
-    bare = dataclasses.replace(made.evidence, texture=None)
+    bare = dataclasses.replace(made.data, texture=None)
     with pytest.raises(ValueError, match="texture"):
         Objective(made.avatar, made.poses, bare, made.settings)
     with pytest.raises(ValueError, match="LPIPS"):
-        Objective(made.avatar, made.poses, made.evidence, dataclasses.replace(made.settings, lpips=0.2))
+        Objective(made.avatar, made.poses, made.data, dataclasses.replace(made.settings, lpips=0.2))

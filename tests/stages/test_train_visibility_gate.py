@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.avatar import load_avatar
-from pipeline.body import load_body
+from pipeline.body import Pose, load_body
 from pipeline.plan import Decision, Plan
 from pipeline.records import read_json
 from pipeline.tables import read_table
@@ -39,10 +39,11 @@ def trainer(subject, tmp_path):
 def truth(subject, tmp_path) -> torch.Tensor:
     """Which body vertices the five training frames have in their picture, [5, V]."""
     context = context_for(subject, tmp_path / "truth")
-    inputs = stage.read_inputs(context)
+    data = stage.read_training_data(context)
+    train = data.clip.split.train
     body = trainer_for(context_for(subject, tmp_path / "whole", gate=False))
     return torch.stack(
-        [stage.ever_in_frame(body.avatar, body.poses, inputs.crops, (frame,)) for frame in inputs.split.train]
+        [stage.ever_in_frame(body.avatar, body.poses, data.crops, (frame,)) for frame in train]
     )
 
 
@@ -192,7 +193,7 @@ def test_finished_avatar_shows_nothing_or_the_base_where_nothing_was_seen(subjec
     kept = read_table(context.output / "visibility.parquet", SCHEMA, "")["kept"]
     expression = torch.zeros(avatar.surfaces[0].canonical.expression_directions.shape[-1])
     with torch.no_grad():
-        gaussians = avatar.gaussians(torch.zeros(55, 3), expression, torch.zeros(3))
+        gaussians = avatar.gaussians(Pose(torch.zeros(55, 3), expression, torch.zeros(3)))
     assert len(avatar) == kept.sum()
     assert len(gaussians) == (len(kept) if unseen == "base" else kept.sum())
     if unseen == "base":

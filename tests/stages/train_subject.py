@@ -71,7 +71,7 @@ def write_subject(folder: Path) -> None:
     camera = facing_camera(WIDTH, HEIGHT, 1.2 * HEIGHT)
     for frame in poses.frames:
         with torch.no_grad():
-            gaussians = avatar.gaussians(poses.rotation[frame], poses.expression[frame], poses.transl[frame])
+            gaussians = avatar.gaussians(poses.pose(frame))
             rendering = render(gaussians, camera)
         over_grey = rendering.color + (1 - rendering.alpha)[..., None] * 0.5
         write_frame(ingest / "frames", frame, (over_grey.clamp(0, 1).numpy() * 255).astype(np.uint8))

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from pipeline.avatar import Architecture, Avatar, build_canonical, load_avatar, pose_features, save_avatar
 from pipeline.avatar.canonical import dilate, tangent_frames, tangent_spacing
-from pipeline.body import Identity, load_body, mean_identity, pose_body, vertex_normals
+from pipeline.body import Identity, Pose, load_body, mean_identity, posed_vertices, vertex_normals
 from pipeline.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.splat import render
@@ -50,7 +50,7 @@ def a_pose(expressions: int = 5):
     generator = torch.Generator().manual_seed(1)
     rotation = 0.2 * torch.randn(55, 3, generator=generator)
     expression = torch.randn(expressions, generator=generator)
-    return rotation, expression, torch.tensor([0.1, -0.3, -1.5])
+    return Pose(rotation, expression, torch.tensor([0.1, -0.3, -1.5]))
 
 
 def awakened(avatar: Avatar) -> Avatar:
@@ -62,19 +62,18 @@ def awakened(avatar: Avatar) -> Avatar:
 
 
 def test_untrained_avatar_is_the_fitted_body(body, identity, avatar, kept):
-    rotation, expression, transl = a_pose()
-    gaussians = avatar.eval().gaussians(rotation, expression, transl)
-    vertices, _ = pose_body(body, identity, rotation[None], expression[None], transl[None])
-    torch.testing.assert_close(gaussians.means[: len(kept)], vertices[0, kept], rtol=1e-4, atol=1e-5)
+    gaussians = avatar.eval().gaussians(a_pose())
+    vertices = posed_vertices(body, identity, a_pose())
+    torch.testing.assert_close(gaussians.means[: len(kept)], vertices[kept], rtol=1e-4, atol=1e-5)
     assert torch.equal(gaussians.colors, torch.full_like(gaussians.colors, 0.5))
 
 
 def test_gaussians_lie_flat_on_the_posed_surface(body, identity):
     everything = torch.arange(len(body.v_template))
     avatar = Avatar(body, identity, everything, dataclasses.replace(SMALL, subdivisions=0)).eval()
-    rotation, expression, transl = a_pose()
-    rotation[20:] = 0  # wild fingers fold the mesh, where a normal means little
-    gaussians = avatar.gaussians(rotation, 0 * expression, transl)
+    pose = a_pose()
+    pose.rotation[20:] = 0  # wild fingers fold the mesh, where a normal means little
+    gaussians = avatar.gaussians(dataclasses.replace(pose, expression=0 * pose.expression))
     w, x, y, z = gaussians.quaternions.unbind(1)
     axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
     normals = vertex_normals(gaussians.means, body.faces)
@@ -139,7 +138,7 @@ def gradients(avatar: Avatar, pose_heads: bool) -> dict[str, float]:
     avatar.train()
     avatar.pose_heads_active = pose_heads
     avatar.zero_grad(set_to_none=True)
-    gaussians = avatar.pose(avatar.decode(), *a_pose()).gaussians
+    gaussians = avatar.pose(avatar.decode(), a_pose()).gaussians
     camera = facing_camera(48, 64, 70.0)
     rendering = render(gaussians, camera)
     (rendering.color.square().sum() + rendering.alpha.sum()).backward()
@@ -173,15 +172,16 @@ def test_texels_that_only_gated_vertices_would_read_get_no_gradient(body, identi
 def test_gradient_reaches_the_pose(avatar):
     awakened(avatar)
     avatar.eval()
-    inputs = [tensor.requires_grad_() for tensor in a_pose()]
-    avatar.gaussians(*inputs).means.square().sum().backward()
+    pose = a_pose()
+    inputs = [tensor.requires_grad_() for tensor in vars(pose).values()]
+    avatar.gaussians(pose).means.square().sum().backward()
     assert all(float(tensor.grad.abs().max()) > 0 for tensor in inputs)
 
 
 def test_head_and_hands_are_not_moved_by_pose_heads(body, identity):
     everything = torch.arange(len(body.v_template))
     avatar = awakened(Avatar(body, identity, everything, SMALL))
-    moved = avatar.pose(avatar.decode(), *a_pose()).pose_offset.abs().sum(1)
+    moved = avatar.pose(avatar.decode(), a_pose()).pose_offset.abs().sum(1)
     canonical = avatar.surfaces[-1].canonical
     still = canonical.is_part("head", "face", "left_hand", "right_hand")
     assert moved[still].max() == 0
@@ -191,10 +191,10 @@ def test_head_and_hands_are_not_moved_by_pose_heads(body, identity):
 def test_noise_reaches_the_pose_heads_alone(avatar):
     awakened(avatar)
     decoded, noise = avatar.decode(), 0.3 * torch.ones(54 * 6)
-    plain, noisy = avatar.pose(decoded, *a_pose()), avatar.pose(decoded, *a_pose(), noise)
+    plain, noisy = avatar.pose(decoded, a_pose()), avatar.pose(decoded, a_pose(), noise)
     assert not torch.equal(plain.color_logit, noisy.color_logit)
     avatar.pose_heads_active = False
-    plain, noisy = avatar.pose(decoded, *a_pose()), avatar.pose(decoded, *a_pose(), noise)
+    plain, noisy = avatar.pose(decoded, a_pose()), avatar.pose(decoded, a_pose(), noise)
     assert torch.equal(plain.gaussians.means, noisy.gaussians.means)
     assert torch.equal(plain.color_logit, noisy.color_logit)
 
@@ -212,7 +212,7 @@ def test_saved_avatar_renders_the_same(tmp_path, body, avatar):
     save_avatar(path, avatar)
     again = load_avatar(path, body)
     for mine, theirs in zip(
-        avatar.gaussians(*a_pose()).tensors(), again.gaussians(*a_pose()).tensors(), strict=True
+        avatar.gaussians(a_pose()).tensors(), again.gaussians(a_pose()).tensors(), strict=True
     ):
         assert torch.equal(mine, theirs)
     second = tmp_path / "again.safetensors"
@@ -221,9 +221,9 @@ def test_saved_avatar_renders_the_same(tmp_path, body, avatar):
 
 
 def test_avatar_in_training_forgets_what_it_decoded(avatar):
-    before = avatar.eval().gaussians(*a_pose())
+    before = avatar.eval().gaussians(a_pose())
     awakened(avatar.train()).eval()
-    assert not torch.equal(before.means, avatar.gaussians(*a_pose()).means)
+    assert not torch.equal(before.means, avatar.gaussians(a_pose()).means)
 
 
 def test_avatar_is_not_saved_with_a_number_that_is_not_finite(tmp_path, avatar):

@@ -8,9 +8,8 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.residual import PLACES, REST, encode, part_rows
-from pipeline.body import PARTS, load_body, mean_identity
+from pipeline.body import Pose, load_body, mean_identity
 from pipeline.workspace import REPOSITORY
-from stages.train import settings as train_settings
 
 SMALL = Architecture(
     plane_resolution=8,
@@ -48,7 +47,7 @@ def made(body, kept, awake=True, **changes) -> Avatar:
 
 def a_pose():
     generator = torch.Generator().manual_seed(1)
-    return (
+    return Pose(
         0.2 * torch.randn(55, 3, generator=generator),
         torch.randn(5, generator=generator),
         torch.tensor([0.1, -0.3, -1.5]),
@@ -66,7 +65,7 @@ def test_encoding_by_hand():
 def test_residuals_add_nothing_at_birth(body, kept):
     plain, born = made(body, kept, awake=False, residual_parts=()), made(body, kept, awake=False)
     for mine, theirs in zip(
-        plain.gaussians(*a_pose()).tensors(), born.gaussians(*a_pose(), 3.0).tensors(), strict=True
+        plain.gaussians(a_pose()).tensors(), born.gaussians(a_pose(), 3.0).tensors(), strict=True
     ):
         assert torch.equal(mine, theirs)
     assert not any(name.startswith("residuals.heads") for name, _ in plain.named_parameters())
@@ -76,9 +75,9 @@ def test_residuals_change_colours_of_their_parts_and_nothing_else(body, kept):
     avatar = made(body, kept)
     canonical = avatar.surfaces[-1].canonical
     with torch.no_grad():
-        posed = avatar.pose(avatar.decode(), *a_pose(), time=3.0)
+        posed = avatar.pose(avatar.decode(), a_pose(), time=3.0)
         avatar.residuals_active = False
-        without = avatar.pose(avatar.decode(), *a_pose(), time=3.0)
+        without = avatar.pose(avatar.decode(), a_pose(), time=3.0)
     assert without.color_residual is None
     moved = (posed.gaussians.colors != without.gaussians.colors).any(1)
     assert torch.equal(moved, canonical.is_part(*REFINED))
@@ -89,7 +88,7 @@ def test_residuals_change_colours_of_their_parts_and_nothing_else(body, kept):
 
 def test_gradients_of_colour_reach_the_residuals_and_of_place_do_not(body, kept):
     avatar = made(body, kept).train()
-    gaussians = avatar.pose(avatar.decode(), *a_pose(), time=3.0).gaussians
+    gaussians = avatar.pose(avatar.decode(), a_pose(), time=3.0).gaussians
     gaussians.means.square().sum().backward(retain_graph=True)
     residual = [parameter for name, parameter in avatar.named_parameters() if name.startswith("residuals.")]
     assert all(parameter.grad is None for parameter in residual)
@@ -100,9 +99,9 @@ def test_gradients_of_colour_reach_the_residuals_and_of_place_do_not(body, kept)
 @pytest.mark.parametrize("place", PLACES)
 def test_place_is_the_skins_or_the_worlds(body, kept, place):
     avatar = made(body, kept, residual_place=place)
-    rotation, expression, transl = a_pose()
-    here = avatar.gaussians(rotation, expression, transl, 3.0).colors
-    there = avatar.gaussians(rotation, expression, transl + 0.3, 3.0).colors
+    pose = a_pose()
+    here = avatar.gaussians(pose, 3.0).colors
+    there = avatar.gaussians(dataclasses.replace(pose, transl=pose.transl + 0.3), 3.0).colors
     assert torch.equal(here, there) == (place == "canonical")
 
 
@@ -121,19 +120,19 @@ def test_time_tells_moments_apart_and_is_clamped_outside_training(body, kept):
     assert len({tuple(code.tolist()) for code in codes}) == 33
     assert torch.equal(avatar.residuals.time_code(100.0), codes[-1])
     assert torch.equal(avatar.residuals.time_code(-7.0), codes[0])
-    last, after = avatar.gaussians(*a_pose(), 6.0), avatar.gaussians(*a_pose(), 60.0)
+    last, after = avatar.gaussians(a_pose(), 6.0), avatar.gaussians(a_pose(), 60.0)
     assert torch.equal(last.colors, after.colors)
-    assert not torch.equal(last.colors, avatar.gaussians(*a_pose(), 4.0).colors)
+    assert not torch.equal(last.colors, avatar.gaussians(a_pose(), 4.0).colors)
 
 
 def test_motion_without_a_clock_has_a_look_of_its_own(body, kept):
     avatar = made(body, kept)
     assert torch.equal(avatar.residuals.time_code(None), torch.zeros(13))
-    timeless = avatar.gaussians(*a_pose()).colors
-    assert torch.equal(timeless, avatar.gaussians(*a_pose(), None).colors)
+    timeless = avatar.gaussians(a_pose()).colors
+    assert torch.equal(timeless, avatar.gaussians(a_pose(), None).colors)
     # It does not hang on when the clip was filmed, and no filmed moment is told the same.
     avatar.residuals.time_range.add_(10)
-    assert torch.equal(timeless, avatar.gaussians(*a_pose()).colors)
+    assert torch.equal(timeless, avatar.gaussians(a_pose()).colors)
     codes = [avatar.residuals.time_code(12 + 4 * share) for share in np.linspace(0, 1, 100)]
     assert min(float(code.norm()) for code in codes) > 1
 
@@ -166,21 +165,16 @@ def test_saved_residuals_are_read_back(tmp_path, body, kept):
     again = load_avatar(path, body)
     assert again.architecture == avatar.architecture and again.residuals_active
     for time in (None, 3.0, 99.0):
-        assert torch.equal(avatar.gaussians(*a_pose(), time).colors, again.gaussians(*a_pose(), time).colors)
-
-
-def test_settings_know_the_parts_and_places():
-    assert set(train_settings.PARTS) == {*PARTS, REST}
-    assert train_settings.PLACES == PLACES
+        assert torch.equal(avatar.gaussians(a_pose(), time).colors, again.gaussians(a_pose(), time).colors)
 
 
 def test_positions_move_only_where_residuals_are_told_to_move_them(body, kept):
     avatar = made(body, kept, residual_moves=True)
     refined = avatar.surfaces[-1].canonical.is_part(*REFINED)
     with torch.no_grad():
-        posed = avatar.pose(avatar.decode(), *a_pose(), time=3.0).gaussians
+        posed = avatar.pose(avatar.decode(), a_pose(), time=3.0).gaussians
         avatar.residuals_active = False
-        without = avatar.pose(avatar.decode(), *a_pose(), time=3.0).gaussians
+        without = avatar.pose(avatar.decode(), a_pose(), time=3.0).gaussians
     moved = (posed.means != without.means).any(1)
     assert torch.equal(moved, refined)
     assert (posed.means - without.means).norm(dim=1).max() < 0.1  # metres
@@ -189,23 +183,24 @@ def test_positions_move_only_where_residuals_are_told_to_move_them(body, kept):
 
 
 def test_moves_are_at_rest_and_turn_with_the_body(body, kept):
-    avatar, (_, expression, transl) = made(body, kept, residual_moves=True), a_pose()
+    avatar = made(body, kept, residual_moves=True)
     turns = [torch.zeros(55, 3) for _ in range(2)]
     turns[1][0, 1] = torch.pi / 2  # the whole body, which the heads are not told
     moves = []
     for rotation in turns:
+        pose = dataclasses.replace(a_pose(), rotation=rotation)
         with torch.no_grad():
             avatar.residuals_active = True
-            there = avatar.gaussians(rotation, expression, transl, 3.0).means
+            there = avatar.gaussians(pose, 3.0).means
             avatar.residuals_active = False
-            moves.append(there - avatar.gaussians(rotation, expression, transl, 3.0).means)
+            moves.append(there - avatar.gaussians(pose, 3.0).means)
     quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # about Y
     torch.testing.assert_close(moves[1], moves[0] @ quarter.T, rtol=0, atol=1e-6)
 
 
 def test_gradients_of_place_reach_exactly_the_parameters_of_moves(body, kept):
     avatar = made(body, kept, residual_moves=True).train()
-    posed = avatar.pose(avatar.decode(), *a_pose(), time=3.0)
+    posed = avatar.pose(avatar.decode(), a_pose(), time=3.0)
     moved = posed.gaussians.means.square().sum()
     residual = {name: one for name, one in avatar.named_parameters() if name.startswith("residuals.")}
     found = dict(zip(residual, torch.autograd.grad(moved, residual.values(), retain_graph=True), strict=True))
@@ -226,7 +221,7 @@ def test_an_avatar_without_moves_has_the_weights_and_the_file_that_it_had(tmp_pa
         if ".last." not in name:
             assert torch.equal(parameter, pairs[name]), name
     for mine, theirs in zip(
-        plain.gaussians(*a_pose(), 3.0).tensors(), moving.gaussians(*a_pose(), 3.0).tensors(), strict=True
+        plain.gaussians(a_pose(), 3.0).tensors(), moving.gaussians(a_pose(), 3.0).tensors(), strict=True
     ):
         assert torch.equal(mine, theirs)
     for avatar, named in ((plain, False), (moving, True)):

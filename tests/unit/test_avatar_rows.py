@@ -28,7 +28,7 @@ def test_rows_that_are_asked_for_are_posed_as_ever_and_teach_as_ever(body, place
     others = torch.ones(len(avatar), dtype=torch.bool).index_fill(0, rows, False)
     results = []
     for asked in (None, rows):
-        posed = avatar.pose(avatar.decode(), *a_pose(), time=1.0, rows=asked)
+        posed = avatar.pose(avatar.decode(), a_pose(), time=1.0, rows=asked)
         values = [posed.pose_offset, posed.log_scale, posed.color_logit, posed.color_residual]
         loss = sum((value[rows] * value[rows].detach().cos()).sum() for value in values)
         results.append((values, torch.autograd.grad(loss, list(avatar.parameters()))))

@@ -5,7 +5,7 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.skin import OWN, nearest_rows
-from pipeline.body import load_body, mean_identity
+from pipeline.body import Pose, load_body, mean_identity
 from pipeline.workspace import REPOSITORY
 
 POSE = torch.zeros(55, 3)
@@ -52,13 +52,15 @@ def test_reskinned_points_have_the_weights_of_the_nearest_vertex(body):
 
 def test_avatar_reads_back_with_its_weights(body, tmp_path):
     avatar = an_avatar(body)
-    rest = (POSE, torch.zeros(avatar.surfaces[0].canonical.expression_directions.shape[2]), torch.zeros(3))
+    rest = Pose(
+        POSE, torch.zeros(avatar.surfaces[0].canonical.expression_directions.shape[2]), torch.zeros(3)
+    )
     with torch.no_grad():
-        plain = avatar.gaussians(*rest)
+        plain = avatar.gaussians(rest)
         avatar.reskin()
-        skinned = avatar.gaussians(*rest)
+        skinned = avatar.gaussians(rest)
     save_avatar(tmp_path / "avatar.safetensors", avatar)
     with torch.no_grad():
-        again = load_avatar(tmp_path / "avatar.safetensors", body).gaussians(*rest)
+        again = load_avatar(tmp_path / "avatar.safetensors", body).gaussians(rest)
     assert not torch.equal(plain.means, skinned.means)
     assert torch.equal(again.means, skinned.means) and torch.equal(again.quaternions, skinned.quaternions)

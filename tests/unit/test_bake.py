@@ -11,12 +11,12 @@ from pipeline.avatar.bake import bake
 from pipeline.avatar.fused import Layers, decode
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import faces_of_vertices, joints_of_points, normals_of_vertices
-from pipeline.body import load_body, mean_identity, vertex_normals
+from pipeline.body import Pose, load_body, mean_identity, vertex_normals
 from pipeline.camera import facing_camera
+from pipeline.numba_kernels import threads
 from pipeline.splat import render
-from pipeline.threads import threads
 from pipeline.workspace import REPOSITORY
-from stages.evaluate.rendering import animator
+from stages.evaluate.methods import baked_animation
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=16, groups=2, subdivisions=1)
 WITH_RESIDUALS = dataclasses.replace(SMALL, residual_parts=("face", "left_hand", "rest"), residual_width=8)
@@ -53,13 +53,13 @@ def a_pose():
     generator = torch.Generator().manual_seed(1)
     rotation = 0.3 * torch.randn(55, 3, generator=generator)
     rotation[0] = torch.tensor([0.0, 3.0, 0.3])  # turned round: every branch of the quaternions
-    return rotation, torch.randn(7, generator=generator), torch.tensor([0.1, -0.3, -1.5])
+    return Pose(rotation, torch.randn(7, generator=generator), torch.tensor([0.1, -0.3, -1.5]))
 
 
 def assert_same(avatar, baked, tolerance, **options):
     with torch.no_grad():
-        expected = avatar.gaussians(*a_pose(), **options).tensors()
-    for mine, theirs in zip(baked.gaussians(*a_pose(), **options).tensors(), expected, strict=True):
+        expected = avatar.gaussians(a_pose(), **options).tensors()
+    for mine, theirs in zip(baked.gaussians(a_pose(), **options).tensors(), expected, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance)
 
 
@@ -77,7 +77,7 @@ def test_baked_residual_colours_follow_the_time(body, place):
     assert set(baked.residuals) >= {"face", "rest"}
     for time in (None, 1.3, 9.0):
         assert_same(avatar, baked, 1e-4, time=time)
-    colors = [baked.gaussians(*a_pose(), time=time).colors for time in (None, 1.3)]
+    colors = [baked.gaussians(a_pose(), time=time).colors for time in (None, 1.3)]
     assert (colors[0] - colors[1]).abs().max() > 1e-4
 
 
@@ -91,8 +91,8 @@ def test_baked_residuals_move_what_the_avatars_move(body, place):
     for time in (None, 1.3):
         assert_same(avatar, baked, 1e-4, time=time)
     avatar.residuals_active = False
-    unmoved = avatar.gaussians(*a_pose()).means
-    assert (baked.gaussians(*a_pose()).means - unmoved).norm(dim=1).max() > 1e-4
+    unmoved = avatar.gaussians(a_pose()).means
+    assert (baked.gaussians(a_pose()).means - unmoved).norm(dim=1).max() > 1e-4
 
 
 def test_baked_pose_correctives_are_as_good_as_exact(body):
@@ -101,7 +101,7 @@ def test_baked_pose_correctives_are_as_good_as_exact(body):
     avatar = an_avatar(body, dataclasses.replace(SMALL, subdivisions=0), directions=directions)
     baked = bake(avatar)
     with torch.no_grad():
-        apart = baked.gaussians(*a_pose()).means - avatar.gaussians(*a_pose()).means
+        apart = baked.gaussians(a_pose()).means - avatar.gaussians(a_pose()).means
     assert apart.norm(dim=1).max() < 2e-4  # a fifth of a millimetre, of offsets of centimetres
 
 
@@ -109,7 +109,7 @@ def test_baked_in_half_precision_renders_as_well_as_the_avatar_in_half_precision
     exact, half = an_avatar(body), an_avatar(body, half_precision=True)
     camera = facing_camera(64, 64, 60.0)
     with torch.no_grad():
-        pictures = [render(one.gaussians(*a_pose()), camera).color for one in (exact, half, bake(half))]
+        pictures = [render(one.gaussians(a_pose()), camera).color for one in (exact, half, bake(half))]
     lost, ours = (float((picture - pictures[0]).abs().mean()) for picture in pictures[1:])
     assert ours < 1.2 * lost + 1e-5
     assert lost > 0
@@ -151,6 +151,6 @@ def test_normals_and_joints_are_those_of_the_body(body):
 def test_evaluate_animates_the_baked_avatar_as_it_would_the_avatar(body):
     avatar = an_avatar(body, WITH_RESIDUALS)
     with torch.no_grad():
-        expected = avatar.gaussians(*a_pose(), 1.3).tensors()
-    for mine, theirs in zip(animator(avatar)(*a_pose(), 1.3).tensors(), expected, strict=True):
+        expected = avatar.gaussians(a_pose(), 1.3).tensors()
+    for mine, theirs in zip(baked_animation(avatar)(a_pose(), 1.3).tensors(), expected, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)

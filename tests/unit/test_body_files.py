@@ -78,8 +78,26 @@ def test_poses_of_unequal_length_are_an_error():
 
 
 def test_no_such_frame_is_an_error(poses):
-    with pytest.raises(ValueError):
-        poses.index(5)
+    for ask in (poses.index, poses.pose, lambda frame: poses.select([3, frame])):
+        with pytest.raises(ValueError, match="no pose of frame 5"):
+            ask(5)
+
+
+def test_a_pose_is_found_by_its_frame_number(poses):
+    pose = poses.pose(9)
+    for name in ("rotation", "expression", "transl"):
+        assert torch.equal(getattr(pose, name), getattr(poses, name)[2])
+    assert torch.equal(pose.global_orient, poses.rotation[2, 0])
+
+
+def test_poses_are_chosen_and_stacked_in_the_order_asked_for(poses):
+    chosen = poses.select([9, 4])
+    assert chosen.frames == (9, 4) and chosen.valid.tolist() == [True, False]
+    stacked = Poses.stack(chosen.frames, [poses.pose(9), poses.pose(4)])
+    assert stacked.frames == (9, 4) and stacked.valid.tolist() == [True, True]
+    for name in ("rotation", "expression", "transl"):
+        assert torch.equal(getattr(chosen, name), getattr(poses, name)[[2, 1]])
+        assert torch.equal(getattr(stacked, name), getattr(chosen, name))
 
 
 def test_damaged_poses_name_the_file_and_the_stage(tmp_path, poses):

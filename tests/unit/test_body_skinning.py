@@ -12,6 +12,7 @@ from pipeline.body import (
     joint_index,
     joint_orientations,
     joint_transforms,
+    linear_blend_skinning,
     load_body,
     mean_identity,
     pose_body,
@@ -19,7 +20,6 @@ from pipeline.body import (
     posed_joints,
     rest_joints,
     rest_vertices,
-    skin,
 )
 from pipeline.workspace import REPOSITORY
 from tests.unit.fake_body import write_official
@@ -69,7 +69,7 @@ def test_skinning_equals_the_independent_formulation(open_body, seed):
     joints = rest_joints(open_body, mean_identity(open_body)).double()
     some = torch.arange(0, len(open_body.v_template), 97)
     weights, points = open_body.skinning_weights[some].double(), open_body.v_template[some].double()
-    skinned = skin(joint_transforms(rotation, joints, open_body.parents), weights, points)
+    skinned = linear_blend_skinning(joint_transforms(rotation, joints, open_body.parents), weights, points)
     for frame in range(2):
         arguments = (rotation[frame].numpy(), joints.numpy(), open_body.parents)
         np.testing.assert_allclose(
@@ -149,7 +149,9 @@ def test_gradients_of_a_pose(fake, scale):
     rotation = (draw((1, 55, 3), scale) if scale else torch.zeros(1, 55, 3).double()).requires_grad_()
 
     def posed(r, joints):
-        return skin(joint_transforms(r, joints, fake.parents), fake.skinning_weights[:2], fake.v_template[:2])
+        return linear_blend_skinning(
+            joint_transforms(r, joints, fake.parents), fake.skinning_weights[:2], fake.v_template[:2]
+        )
 
     joints = rest_joints(fake, identity)
     if scale:

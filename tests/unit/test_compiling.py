@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.compiling import CompileTimer, compile_timer
-from pipeline.study import _cpu_seconds
+from pipeline.studies.variants import cpu_seconds
 from stages.train.timer import TrainingTimer
 
 
@@ -41,8 +41,8 @@ def test_only_what_is_compiled_while_it_listens_is_counted():
 
 def test_a_study_does_not_charge_its_first_run_for_compiling():
     killed_once = {"earlier_cpu_seconds": 10.0, "compile_cpu_seconds": 25.0}
-    assert _cpu_seconds({"cpu_seconds": 50.0, "timings": killed_once}) == 35
-    assert _cpu_seconds({"cpu_seconds": 50.0, "timings": {}}) == 50  # a version from before, or another stage
+    assert cpu_seconds({"cpu_seconds": 50.0, "timings": killed_once}) == 35
+    assert cpu_seconds({"cpu_seconds": 50.0, "timings": {}}) == 50  # a version from before, or another stage
 
 
 def test_the_training_timer_leaves_out_what_was_compiled(tmp_path):

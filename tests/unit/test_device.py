@@ -11,10 +11,9 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar, heads
 from pipeline.avatar.heads import Head
 from pipeline.avatar.posing import plain_normals, plain_place
-from pipeline.body import joint_transforms, load_body, mean_identity
-from pipeline.device import DEVICES, moved, resolve
+from pipeline.body import Pose, joint_transforms, load_body, mean_identity
+from pipeline.device import moved, resolve
 from pipeline.errors import UserError
-from stages.train import settings
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
@@ -41,12 +40,6 @@ def test_cuda_without_a_gpu_names_the_remedy(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UserError, match=r"train\.device=cpu"):
         resolve("cuda")
-
-
-def test_the_setting_knows_the_same_words():
-    assert settings.DEVICES == DEVICES
-    with pytest.raises(ValueError, match=r"train\.device"):
-        settings.TrainSettings(device="tpu")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,11 +100,11 @@ def test_a_head_in_plain_torch_is_the_fused_one_with_gradients(monkeypatch, half
 
 
 def test_an_avatar_moves_there_and_back(avatar):
-    pose = torch.zeros(55, 3), torch.zeros(5), torch.zeros(3)
+    pose = Pose(torch.zeros(55, 3), torch.zeros(5), torch.zeros(3))
     with torch.no_grad(), pretend_device():
-        before = avatar.eval().gaussians(*pose)
-        there = avatar.to(DEVICE).gaussians(*moved(pose, DEVICE))
+        before = avatar.eval().gaussians(pose)
+        there = avatar.to(DEVICE).gaussians(moved(pose, DEVICE))
         assert all(isinstance(one, Elsewhere) for one in there.tensors())
-        after = avatar.to("cpu").gaussians(*pose)
+        after = avatar.to("cpu").gaussians(pose)
     for one, other in zip(before.tensors(), after.tensors(), strict=True):
         assert torch.equal(one, other)

@@ -46,8 +46,9 @@ def test_one_man_is_himself_and_not_the_other(assets_folder):
                 f.to_ndarray(format="rgb24") for f, _ in zip(video.decode(video=0), range(30), strict=False)
             ]
         faces[name] = [reader.read(frame) for frame in (frames[0], frames[-1])]
-        left, top, right, bottom = faces[name][0].box
-        assert 0 <= left < right <= frames[0].shape[1] and 0 <= top < bottom <= frames[0].shape[0]
+        box = faces[name][0].box
+        assert 0 <= box.left < box.right <= frames[0].shape[1]
+        assert 0 <= box.top < box.bottom <= frames[0].shape[0]
     smile, phone = ([face.embedding for face in faces[name]] for name in ("smile", "carphone"))
     assert identity_distance(*smile) < 0.45 and identity_distance(*phone) < 0.45
     assert min(identity_distance(a, b) for a in smile for b in phone) > 0.65

@@ -5,9 +5,8 @@ import json
 
 import pytest
 
-from pipeline.body import PARTS
 from pipeline.errors import UserError
-from pipeline.plan import EFFECTS, SEEN_PARTS, Decision, Plan, read_plan, write_plan
+from pipeline.plan import EFFECTS, Decision, Plan, read_plan, write_plan
 
 
 def made_plan(**changes) -> Plan:
@@ -34,10 +33,6 @@ def test_order_of_decisions_does_not_change_the_file(tmp_path):
     write_plan(tmp_path / "a.json", plan)
     write_plan(tmp_path / "b.json", Plan(plan.decisions[::-1]))
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
-
-
-def test_parts_are_the_bodys():
-    assert tuple(f"seen_{part}" for part in PARTS) == SEEN_PARTS
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from benchmarks.avatars import avatar_of
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Architecture
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 
 SMALL = Architecture(plane_resolution=16, plane_channels=4, width=16, groups=4)
 COUNT = 7000  # head, arms and some of the torso of the unsubdivided body
@@ -45,7 +45,7 @@ def test_a_body_without_enough_vertices_is_refused():
 def test_straightforward_gaussians_are_ours(pair):
     avatar, plain = pair
     pose = step.frames_of(avatar, 1, 16)[0].pose
-    ours, theirs = (model.pose(model.decode(), *pose.values()) for model in pair)
+    ours, theirs = (model.pose(model.decode(), pose) for model in pair)
     for mine, other in zip(ours.gaussians.tensors(), theirs.gaussians.tensors(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-5)
     assert ours.pose_offset.abs().max() > 0

@@ -1,12 +1,10 @@
 """Every term of the training objective, against a hand value or an independent implementation."""
 
-import numba
 import pytest
 import torch
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.avatar.sparse import SparsePair
-from pipeline.threads import threads
+from pipeline.metrics import ssim_loss
 from stages.train import losses
 
 # A path of three vertices, 0 - 1 - 2.
@@ -21,75 +19,6 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 
 def test_l1_by_hand():
     assert float(losses.l1(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.25))) == 0.25
-
-
-@pytest.mark.parametrize("size", [(11, 11), (24, 37)])
-def test_ssim_equals_torchmetrics_with_gradient(size):
-    target = drawn(*size, 3)
-    image = (0.7 * target + 0.3 * drawn(*size, 3, seed=1)).requires_grad_()
-    ours = losses.ssim(image, target)
-    ours.backward()
-    other = image.detach().clone().requires_grad_()
-    theirs = 1 - structural_similarity_index_measure(
-        other.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0
-    )
-    theirs.backward()
-    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(image.grad, other.grad, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [(11, 11), (12, 64), (77, 33)])
-def test_fused_ssim_is_the_plain_one_with_gradient(size):
-    target = drawn(*size, 3).double()
-    image = (0.8 * target + 0.2 * drawn(*size, 3, seed=1)).requires_grad_()
-    ours, theirs = losses.ssim(image, target), losses.plain_ssim(image, target)
-    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
-    gradients = [torch.autograd.grad(3 * value, image)[0] for value in (ours, theirs)]
-    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)
-    single = image.detach().float().requires_grad_()
-    losses.ssim(single, target.float()).backward()
-    torch.testing.assert_close(3 * single.grad.double(), gradients[1], rtol=1e-3, atol=1e-6)
-
-
-def test_fused_ssim_gradcheck():
-    target, image = drawn(13, 11, 3).double(), drawn(13, 11, 3, seed=1).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: losses.ssim(x, target), image)
-
-
-def test_ssim_is_the_same_on_any_number_of_threads():
-    numba.get_num_threads()
-    image, target, found = drawn(70, 40, 3).requires_grad_(), drawn(70, 40, 3, seed=1), []
-    for count in (1, 2):
-        with threads(count):
-            value = losses.ssim(image, target)
-            found.append((value, *torch.autograd.grad(value, image)))
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
-
-
-def test_ssim_is_differentiable_in_its_target_too():
-    image, target = drawn(16, 16, 3), drawn(16, 16, 3, seed=1).requires_grad_()
-    losses.ssim(image, target).backward()
-    assert target.grad.abs().max() > 0
-
-
-def test_ssim_lets_nothing_that_is_not_finite_vanish():
-    image = drawn(40, 20, 3)
-    image[3, 4, 1] = float("nan")
-    assert losses.ssim(image, drawn(40, 20, 3, seed=1)).isnan()
-
-
-def test_ssim_of_equal_images_is_zero_and_grows_with_noise():
-    target = drawn(20, 20, 3)
-    noise = drawn(20, 20, 3, seed=2) - 0.5
-    values = [float(losses.ssim(target + amount * noise, target)) for amount in (0, 0.05, 0.2)]
-    assert abs(values[0]) < 1e-6
-    assert values[0] < values[1] < values[2]
-
-
-def test_over_by_hand():
-    color, alpha = torch.full((1, 1, 3), 0.3), torch.tensor([[0.5]])
-    result = losses.over(color, alpha, torch.tensor([1.0, 0.0, 0.4]))
-    torch.testing.assert_close(result.flatten(), torch.tensor([0.8, 0.3, 0.5]))
 
 
 def test_laplacian_by_hand():
@@ -127,7 +56,7 @@ def test_blended_image_has_the_weighted_l1_and_no_gradient_at_weight_zero():
     weight[7] = 0.25
     value = losses.l1(losses.blend_to_target(image, target, weight), target)
     torch.testing.assert_close(value, (weight[..., None] * (image - target).abs()).mean())
-    (value + losses.ssim(losses.blend_to_target(image, target, weight), target)).backward()
+    (value + ssim_loss(losses.blend_to_target(image, target, weight), target)).backward()
     assert (image.grad[3:5] == 0).all() and (image.grad[7] != 0).any()
 
 

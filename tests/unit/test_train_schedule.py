@@ -1,7 +1,5 @@
 """What depends on the iteration alone, and the settings that set it."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -44,19 +42,3 @@ def test_draws_need_no_history():
     assert torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 5, 9))
     assert not torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 6, 9))
     assert forward != [schedule.drawn_frame(8, frames, position) for position in range(120)]
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("iterations", 0),
-        ("subdivisions", 3),
-        ("groups", 7),
-        ("opacity", 1.0),
-        ("pose_heads_from", 1.5),
-        ("seed", -1),
-    ],
-)
-def test_impossible_setting_names_itself(field, value):
-    with pytest.raises(ValueError, match=f"train.{field}"):
-        dataclasses.replace(SETTINGS, **{field: value})

@@ -1,7 +1,6 @@
 """A texture learnt from the clip without a network: gathered, completed, and painted onto the turn."""
 
-from pipeline.texture import FineSurface, Seen, fine_surface, paint
+from pipeline.texture import FineSurface, Seen, fine_surface, gather, paint
 from stages.auxiliary.texture.complete import complete
-from stages.auxiliary.texture.project import gather
 
 __all__ = ["FineSurface", "Seen", "complete", "fine_surface", "gather", "paint"]

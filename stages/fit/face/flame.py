@@ -32,7 +32,7 @@ _LIMIT = 3.0  # of a coefficient that is carried over to another basis
 
 @dataclasses.dataclass(frozen=True)
 class Correspondence:
-    """Where the body's landmarks lie on FLAME.
+    """Places of the body's landmarks on FLAME's surface.
 
     Attributes:
         kept: [F] bool, the landmarks that have a place there.
@@ -58,7 +58,7 @@ class Correspondence:
 def face_from_flame(
     model: FaceModel, body: BodyModel, flame: FlameModel, parameters: FlameParameters
 ) -> FaceTarget | None:
-    """What FLAME says about the clip's face.
+    """The clip's face as FLAME and DECA's parameters describe it.
 
     Args:
         model: the body's face.
@@ -154,7 +154,7 @@ def transfer(ours: Tensor, theirs: Tensor, expression: Tensor) -> Tensor:
 
 
 def _triangles_around(triangles: np.ndarray, count: int) -> np.ndarray:
-    """For each vertex the triangles that it is a corner of, [V, most], filled up with the first of them."""
+    """The triangles around each vertex, [V, most], filled up with the first of them."""
     order = np.argsort(triangles.ravel(), kind="stable")
     owners = order // 3
     degree = np.bincount(triangles.ravel(), minlength=count)

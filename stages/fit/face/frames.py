@@ -38,7 +38,7 @@ _OUTLIER = 4.0  # squared residual over squared noise from which a point loses i
 
 @dataclasses.dataclass(frozen=True)
 class Sight:
-    """What was seen of a face's F points in T frames.
+    """A face's F points as they were seen in T frames.
 
     Attributes:
         pixels: [T, F, 2], relative to the principal point.
@@ -78,7 +78,7 @@ class Heads:
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """How good the observations are.
+    """The quality of the observations.
 
     Attributes:
         noise: [T], pixels, standard deviation of x and y.
@@ -126,7 +126,7 @@ def start(model: FaceModel, sight: Sight) -> Heads:
 
 
 def rigidity(model: FaceModel) -> Tensor:
-    """How little each point moves in the skull: [F], 1 for the bridge of the nose, near 0 for the lips."""
+    """The rigidity of each point in the skull: [F], 1 for the bridge of the nose, near 0 for the lips."""
     moves = model.expression.square().sum((1, 2)).sqrt() / 0.004
     return (1 - model.jaw_weight).clamp_min(0) ** 4 / (1 + moves.square())
 

@@ -118,7 +118,7 @@ def _misfit(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens:
 
 
 def _sizes(sight: Sight) -> Tensor:
-    """How large each face is in pixels, [T]: the spread of its points, depth included."""
+    """The size of each face in pixels, [T]: the spread of its points, depth included."""
     weight = sight.mask[..., None]
     places = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
     total = weight.sum(1).clamp_min(1)

@@ -1,4 +1,4 @@
-"""What the face that is fitted first says to the registration: where the face is at rest, and its expression.
+"""The face that is fitted first, as the registration's target: its places at rest, and its expression.
 
 Frame of reference: the head joint's at rest. Its origin is the rest head joint, its axes are the body's
 (Y up, +Z where the face looks, the subject's left is +X). A single uncalibrated camera tells neither how

@@ -22,7 +22,7 @@ _KINDS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class CalibratedCamera:
     """One camera as a file gives it.
 
     Attributes:
@@ -51,7 +51,7 @@ class Calibration:
 
     path: Path
     kind: str
-    views: Mapping[str, View]
+    views: Mapping[str, CalibratedCamera]
     metric: bool
     upright: bool
     depth: float = float("nan")
@@ -103,7 +103,7 @@ def _read_own(path: Path) -> Calibration:
     for frame, camera in read_cameras(path, torch.float64).items():
         k = camera.intrinsics.numpy()
         lens = pinhole_lens(camera.width, camera.height, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]))
-        views[str(frame)] = View(lens, camera.rotation.numpy(), camera.translation.numpy())
+        views[str(frame)] = CalibratedCamera(lens, camera.rotation.numpy(), camera.translation.numpy())
     if not views:
         raise UserError(f"{path} holds no camera: give another file, or set ingest.cameras=auto")
     return Calibration(path, "cameras.parquet", views, metric=True, upright=True)
@@ -118,7 +118,7 @@ def _read_folder(path: Path, clip: Clip) -> Calibration:
     return Calibration(path, "cam_params", views, metric=False, upright=False)
 
 
-def _read_json_view(file: Path, clip: Clip) -> View:
+def _read_json_view(file: Path, clip: Clip) -> CalibratedCamera:
     value = read_json(file, "write it again with R [3, 3], t [3], focal [2] and princpt [2]")
     parts = {}
     for key, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("princpt", (2,))):
@@ -130,7 +130,7 @@ def _read_json_view(file: Path, clip: Clip) -> View:
     if parts["focal"].min() <= 0:
         raise UserError(f"{file}: the focal lengths must be positive pixels, not {parts['focal'].tolist()}")
     lens = pinhole_lens(clip.width, clip.height, tuple(parts["focal"]), tuple(parts["princpt"]))
-    return View(lens, parts["R"], parts["t"])
+    return CalibratedCamera(lens, parts["R"], parts["t"])
 
 
 def check_rotation(rotation: np.ndarray, where: str) -> None:

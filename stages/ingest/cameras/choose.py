@@ -16,7 +16,7 @@ from pipeline.errors import UserError
 from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.apply import select
-from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, pinhole_lens
+from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
 from stages.ingest.cameras.gaps import fill_gaps
 from stages.ingest.cameras.lens import LEFT_ALONE, distortion, pinhole_of, stored_view
 from stages.ingest.cameras.motion import measure_motion
@@ -116,7 +116,9 @@ def _find(context: Context, clip: Clip, detected: Detected) -> Chosen | None:
     context.log(f"cameras: rotations only, which leave {share:.1%} of the background's motion unexplained")
     turned = settle(np.stack(rotations), np.zeros((len(frames), 3)))
     lens = pinhole_lens(width, height, (focal, focal), (width / 2, height / 2))
-    views = {frame: View(lens, turned[0][row], turned[1][row]) for row, frame in enumerate(frames)}
+    views = {
+        frame: CalibratedCamera(lens, turned[0][row], turned[1][row]) for row, frame in enumerate(frames)
+    }
     return Chosen(_cameras(views), {}, {"source": "rotation", "unexplained": round(share, 6)})
 
 
@@ -129,7 +131,7 @@ def _from_model(
     mapped = mapped_frames(frames)
     longest = max(GAP_SECONDS * (clip.fps or 25.0), 3 * float(np.diff(mapped).max(initial=1)))
     poses = fill_gaps({f: (v.rotation, v.translation) for f, v in known.items()}, frames, int(longest))
-    views = {frame: View(lens, *pose) for frame, pose in poses.items()}
+    views = {frame: CalibratedCamera(lens, *pose) for frame, pose in poses.items()}
     scaled, scale = _metric(context, detected.keypoints, views, kept_rate(context, clip), model)
     context.log(
         f"cameras: structure from motion placed {len(known)} of {len(mapped)} frames, focal length "
@@ -197,11 +199,11 @@ def _distorted(pixels: float, taken_out: bool) -> str:
 def _metric(
     context: Context,
     keypoints: Keypoints,
-    views: Mapping[int, View],
+    views: Mapping[int, CalibratedCamera],
     fps: float,
     model: Calibration,
     poses: InitialPoses | None = None,
-) -> tuple[dict[int, View], Scale]:
+) -> tuple[dict[int, CalibratedCamera], Scale]:
     """The views with translations in metres."""
     scale = Scale(context.settings.camera_scale, f"{context.settings.camera_scale:g} metres a unit, as set")
     if not scale.metres:
@@ -223,7 +225,7 @@ def _metric(
     }, scale
 
 
-def _settled(views: Mapping[int, View]) -> dict[int, View]:
+def _settled(views: Mapping[int, CalibratedCamera]) -> dict[int, CalibratedCamera]:
     """The same cameras in our world: see :mod:`.world`."""
     order = sorted(views)
     rotations, translations = settle(
@@ -236,7 +238,7 @@ def _settled(views: Mapping[int, View]) -> dict[int, View]:
     }
 
 
-def _cameras(views: Mapping[int, View]) -> dict[int, Camera]:
+def _cameras(views: Mapping[int, CalibratedCamera]) -> dict[int, Camera]:
     """The pinholes of views of the stored frames."""
     cameras = {}
     for frame, view in sorted(views.items()):

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
-from stages.ingest.cameras.calibration import Calibration, View
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration
 
 PLACES = (".", "sparse", "sparse/0", "0")
 LOOKED_AT = 20  # pictures whose points say how far the scene is
@@ -43,7 +43,7 @@ def model_views(model: pycolmap.Reconstruction, folder: Path) -> Calibration:
         image = model.image(number)
         pose = image.cam_from_world()
         lens = model.camera(image.camera_id)
-        views[image.name] = View(lens, pose.rotation.matrix(), np.array(pose.translation))
+        views[image.name] = CalibratedCamera(lens, pose.rotation.matrix(), np.array(pose.translation))
     if not views:
         raise UserError(f"{folder} is a COLMAP model without a registered picture: run COLMAP again")
     return Calibration(folder, "COLMAP", views, metric=False, upright=False, depth=scene_depth(model))

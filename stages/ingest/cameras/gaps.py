@@ -8,10 +8,10 @@ import numpy as np
 import roma
 import torch
 
-Pose = tuple[np.ndarray, np.ndarray]  # rotation [3, 3] and translation [3], world-to-camera
+Extrinsics = tuple[np.ndarray, np.ndarray]  # rotation [3, 3] and translation [3], world-to-camera
 
 
-def fill_gaps(known: Mapping[int, Pose], frames: Sequence[int], longest: int) -> dict[int, Pose]:
+def fill_gaps(known: Mapping[int, Extrinsics], frames: Sequence[int], longest: int) -> dict[int, Extrinsics]:
     """The known poses, and those between two of them: the turn by slerp, the camera's centre linearly.
 
     Args:
@@ -34,7 +34,7 @@ def fill_gaps(known: Mapping[int, Pose], frames: Sequence[int], longest: int) ->
     return poses
 
 
-def _between(first: Pose, second: Pose, share: float) -> Pose:
+def _between(first: Extrinsics, second: Extrinsics, share: float) -> Extrinsics:
     turns = roma.rotmat_to_unitquat(torch.from_numpy(np.stack([first[0], second[0]])))
     turn = roma.unitquat_slerp(
         turns[0], turns[1], torch.tensor([share], dtype=turns.dtype), shortest_arc=True

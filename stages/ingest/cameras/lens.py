@@ -15,7 +15,7 @@ from pipeline.detection.wholebody import inside
 from pipeline.errors import UserError
 from pipeline.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.keypoints import Keypoints
-from stages.ingest.cameras.calibration import View, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
 from stages.ingest.video import Clip
 
 SAME_SHAPE = 0.02  # by how much the calibrated picture's proportions may differ from the clip's
@@ -23,7 +23,7 @@ LEFT_ALONE = 1.0  # pixels of the stored frame; resampling would cost more than 
 GRID = 33  # points a side at which distortion is measured
 
 
-def stored_view(view: View, clip: Clip, width: int, height: int, path: Path) -> View:
+def stored_view(view: CalibratedCamera, clip: Clip, width: int, height: int, path: Path) -> CalibratedCamera:
     """A view with the lens of the stored frames: turned as the clip's frames were, and scaled.
 
     Args:
@@ -131,7 +131,7 @@ def _same_shape(width: int, height: int, clip: Clip) -> bool:
     return abs(width / height * clip.height / clip.width - 1) <= SAME_SHAPE
 
 
-def _turned(view: View, turns: int, path: Path) -> View:
+def _turned(view: CalibratedCamera, turns: int, path: Path) -> CalibratedCamera:
     """The view of the picture turned counter-clockwise by ``turns`` quarters, as the clip's frames were."""
     if turns % 2 == 0:
         return view
@@ -143,4 +143,6 @@ def _turned(view: View, turns: int, path: Path) -> View:
     centre = (y, width - x) if turns % 4 == 1 else (height - y, x)
     sign = 1.0 if turns % 4 == 1 else -1.0
     turn = np.array([[0, sign, 0], [-sign, 0, 0], [0, 0, 1.0]])
-    return View(pinhole_lens(height, width, (fy, fx), centre), turn @ view.rotation, turn @ view.translation)
+    return CalibratedCamera(
+        pinhole_lens(height, width, (fy, fx), centre), turn @ view.rotation, turn @ view.translation
+    )

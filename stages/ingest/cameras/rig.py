@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
-from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation
+from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
 
 _Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # coordinates there -> coordinates here
 _FIXED_POINT = 64.0  # Qualisys writes pixels in 64ths
@@ -92,7 +92,7 @@ def read_toml_rig(path: Path, name: str) -> Calibration:
 def _standing(
     path: Path, kind: str, lens: pycolmap.Camera, rotation: np.ndarray, translation: np.ndarray
 ) -> Calibration:
-    view = View(lens, rotation @ _Z_UP_TO_Y_UP.T, translation)
+    view = CalibratedCamera(lens, rotation @ _Z_UP_TO_Y_UP.T, translation)
     return Calibration(path, kind, {EVERY_FRAME: view}, metric=True, upright=True)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.frames import read_mask, write_mask
+from pipeline.spread import spread_end_to_end
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.colmap import model_views
 from stages.ingest.cameras.motion import person_free
@@ -32,8 +33,7 @@ LEAST_ANGLE = 1.0  # degrees; where the rays of points cross at less, a median o
 
 def mapped_frames(frames: Sequence[int]) -> list[int]:
     """The frames that are mapped: all, or ``MOST_FRAMES`` of them with the first and the last."""
-    rows = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_FRAMES)).round().astype(int))
-    return [frames[row] for row in rows]
+    return spread_end_to_end(frames, MOST_FRAMES)
 
 
 def structure_from_motion(

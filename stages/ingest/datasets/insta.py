@@ -35,7 +35,13 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import check_picture, inside, parse_json, read_torch
-from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.cameras.calibration import (
+    EVERY_FRAME,
+    CalibratedCamera,
+    Calibration,
+    check_rotation,
+    pinhole_lens,
+)
 from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import Clip
@@ -63,7 +69,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         calibration = Calibration(path, "INSTA", views, metric=True, upright=False)
     elif heads:
         lens = _lens(next(iter(heads.values()))["K"], clip, source / "checkpoint")
-        still = View(lens, np.eye(3), np.zeros(3))
+        still = CalibratedCamera(lens, np.eye(3), np.zeros(3))
         calibration = Calibration(path, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
     else:
         raise UserError(f"{source} has neither transforms.json nor checkpoint/*.frame: {_REMEDY}")
@@ -72,7 +78,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     return Recording("insta", (shot,), _listed(source, "train"), _listed(source, "test"))
 
 
-def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, View]:
+def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, CalibratedCamera]:
     """Frame number -> camera."""
     views = {}
     for number, frame in _entries(source, table, path).items():
@@ -93,7 +99,7 @@ def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, View]:
         lens = pinhole_lens(
             clip.width, clip.height, (params[0][0], params[1][0]), (params[0][1], params[1][1])
         )
-        views[str(number)] = View(lens, rotation, -rotation @ matrix[:3, 3])
+        views[str(number)] = CalibratedCamera(lens, rotation, -rotation @ matrix[:3, 3])
     return views
 
 

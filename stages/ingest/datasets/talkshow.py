@@ -27,7 +27,7 @@ import torch
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_pickle
-from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, pinhole_lens
+from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
 from stages.ingest.datasets.recording import Recording, Shot, entry, numbers
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import open_clip
@@ -67,7 +67,7 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
 
 
-def _view(table: Any, path: Path) -> View:
+def _view(table: Any, path: Path) -> CalibratedCamera:
     def number(key: str, shape: tuple[int, ...]) -> np.ndarray:
         return numbers(entry(table, key, path, _REMEDY), shape, f"{path}, '{key}'", _REMEDY)
 
@@ -77,7 +77,7 @@ def _view(table: Any, path: Path) -> View:
     if min(size) < 1 or max(size) > 100_000 or focal[0] <= 0 or len(centre) < 2:
         raise UserError(f"{path}: its camera is empty: {_REMEDY}")
     lens = pinhole_lens(size[0], size[1], (focal[0], focal[-1]), (centre[0], centre[1]))
-    return View(lens, np.eye(3), np.zeros(3))
+    return CalibratedCamera(lens, np.eye(3), np.zeros(3))
 
 
 def _poses(table: Any, path: Path) -> InitialPoses:

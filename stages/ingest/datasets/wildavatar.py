@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import parse_json
-from stages.ingest.cameras.calibration import Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation, pinhole_lens
 from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
 from stages.ingest.datasets.smpl import ROOT, smpl_poses
 from stages.ingest.settings import IngestSettings
@@ -67,13 +67,13 @@ def _frames(table: Any, path: Path) -> dict[int, dict[str, np.ndarray]]:
     return dict(sorted(found.items()))
 
 
-def _view(frame: dict[str, np.ndarray], clip: Clip, where: str) -> View:
+def _view(frame: dict[str, np.ndarray], clip: Clip, where: str) -> CalibratedCamera:
     matrix, extrinsics = frame["cam_intrinsics"], frame["cam_extrinsics"]
     if min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise UserError(f"{where}: the focal length is not positive: {_REMEDY}")
     check_rotation(extrinsics[:3, :3], where)
     lens = pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
-    return View(lens, extrinsics[:3, :3], extrinsics[:3, 3])
+    return CalibratedCamera(lens, extrinsics[:3, :3], extrinsics[:3, 3])
 
 
 def _poses(frames: dict[int, dict[str, np.ndarray]]) -> InitialPoses:

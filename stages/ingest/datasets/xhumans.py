@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_npz, read_pickle
-from stages.ingest.cameras.calibration import Calibration, View, check_rotation, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation, pinhole_lens
+from stages.ingest.cameras.gaps import Extrinsics
 from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import Clip
@@ -36,7 +37,6 @@ from stages.ingest.video import Clip
 _REMEDY = "unpack the X-Humans take again"
 _BODY = (("global_orient", 3, 0), ("body_pose", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
          ("reye_pose", 3, 24))  # fmt: skip
-Pose = tuple[np.ndarray, np.ndarray]
 
 
 def recognises(folder: Path) -> bool:
@@ -52,7 +52,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     table = read_npz(path, _REMEDY)
     cameras = _cameras(table, path, list(clip.pictures))
     lens = _lens(numbers(entry(table, "intrinsic", path, _REMEDY), (3, 3), f"{path}", _REMEDY), clip)
-    views = {str(frame): View(lens, *pose) for frame, pose in cameras.items()}
+    views = {str(frame): CalibratedCamera(lens, *pose) for frame, pose in cameras.items()}
     shot = Shot(
         clip=clip,
         calibration=Calibration(path, "X-Humans", views, metric=True, upright=False),
@@ -63,7 +63,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     return Recording("xhumans", (shot,))
 
 
-def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, Pose]:
+def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, Extrinsics]:
     """Frame -> world-to-camera, by the order of the pictures."""
     value = np.asarray(entry(table, "extrinsic", path, _REMEDY))
     rows = value.shape[-2] if value.ndim >= 2 else 0
@@ -86,7 +86,7 @@ def _lens(matrix: np.ndarray, clip: Clip) -> pycolmap.Camera:
     return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
 
 
-def _poses(files: dict[int, Path], cameras: dict[int, Pose]) -> InitialPoses | None:
+def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPoses | None:
     known = {frame: file for frame, file in files.items() if frame in cameras}
     if not known:
         return None

@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import inside, read_npy
-from stages.ingest.cameras.calibration import EVERY_FRAME, Calibration, View, check_rotation
+from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
 from stages.ingest.cameras.world import settle
 from stages.ingest.datasets.recording import STEP, Recording, Shot, entry, folder_clip, numbers
 from stages.ingest.datasets.smpl import ROOT, smpl_poses
@@ -48,7 +48,7 @@ _REMEDY = "unpack the ZJU-MoCap subject again"
 class Eye:
     """A camera: as it is handed on, and as annots.npy has it (world-to-camera, metres)."""
 
-    view: View
+    view: CalibratedCamera
     rotation: np.ndarray
     translation: np.ndarray
 
@@ -121,7 +121,7 @@ def _eyes(annots: Any, cameras: list[int], source: Path, names: list[list[str]])
         lenses.append(_lens(parts["K"], parts["D"], clip.width, clip.height))
     settled = settle(np.stack(rotations), np.stack(translations))
     rows = zip(lenses, *settled, rotations, translations, strict=True)
-    return [Eye(View(lens, turn, shift), *original) for lens, turn, shift, *original in rows]
+    return [Eye(CalibratedCamera(lens, turn, shift), *original) for lens, turn, shift, *original in rows]
 
 
 def _lens(matrix: np.ndarray, bend: np.ndarray, width: int, height: int) -> pycolmap.Camera:

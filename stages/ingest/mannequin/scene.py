@@ -14,11 +14,11 @@ from pipeline.body import (
     Identity,
     expression_offsets,
     joint_transforms,
+    linear_blend_skinning,
     pose_offsets,
     rasterize,
     rest_joints,
     rest_vertices,
-    skin,
     vertex_normals,
 )
 from pipeline.camera import Camera
@@ -80,7 +80,9 @@ class Scene:
         correctives = pose_offsets(self.body, poses.rotation[row])
         if correctives is not None:
             rest = rest + correctives
-        return skin(self.transforms[row], self.body.skinning_weights, rest) + poses.transl[row]
+        return (
+            linear_blend_skinning(self.transforms[row], self.body.skinning_weights, rest) + poses.transl[row]
+        )
 
 
 def make_scene(body: BodyModel, clothed: Identity, appearance: Appearance, shot: Shot, seed: int) -> Scene:

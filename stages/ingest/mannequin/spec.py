@@ -3,27 +3,55 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
 
-FRAMINGS = ("full", "upper", "head")
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from pipeline.settings import SETTINGS, Count, Fraction, FrameRate, Seed, Side
+
+Framing = Literal["full", "upper", "head"]
+Detector = Literal["mediapipe", "heatmap"]
+UnseenView = Literal["left", "right", "back", "above"]
+FilmedFrames = Annotated[int, Field(ge=2, le=1_000_000)]
+Noise = Annotated[float, Field(ge=0, le=100)]
+
+FRAMINGS: tuple[Framing, ...] = get_args(Framing)
+DETECTORS: tuple[Detector, ...] = get_args(Detector)
 LAYERS = ("stand", "turn", "sway", "gesture", "curl", "speech", "nod")
-DETECTORS = ("mediapipe", "heatmap")
-VIEWS = {"left": (60.0, 0.0), "right": (-60.0, 0.0), "back": (180.0, 0.0), "above": (25.0, 40.0)}
+VIEWS: Mapping[UnseenView, tuple[float, float]] = {
+    "left": (60.0, 0.0), "right": (-60.0, 0.0), "back": (180.0, 0.0), "above": (25.0, 40.0),
+}  # fmt: skip
 """Cameras that the pipeline never sees: azimuth towards the subject's left and elevation, degrees."""
 
-DEFAULT_MOTION = {
+DEFAULT_MOTION: Mapping[Framing, str] = {
     "full": "turn+gesture+curl+speech",
     "upper": "sway+gesture+curl+speech",
     "head": "nod+speech",
 }
 
 
-@dataclasses.dataclass(frozen=True)
+def is_bvh(motion: str) -> bool:
+    """Whether a motion is a motion-capture file."""
+    return motion.lower().endswith(".bvh")
+
+
+def check_motion(motion: str) -> None:
+    """Refuses, with a ValueError, what is neither empty nor a BVH file nor names of ``LAYERS``."""
+    unknown = [] if is_bvh(motion) or not motion else sorted({*motion.split("+")} - {*LAYERS})
+    if unknown:
+        raise ValueError(
+            f"the mannequin has no motion {unknown[0]!r}: name a .bvh file, or {', '.join(LAYERS)}"
+        )
+
+
+@dataclass(frozen=True, config=SETTINGS)
 class MannequinSpec:
-    """A clip of the mannequin; equal specs give equal bytes.
+    """A clip of the mannequin; equal specs give equal bytes. The ranges are those of ingest's settings.
 
     Attributes:
-        framing: one of ``FRAMINGS``: the whole body, from the waist, or from the collarbones up.
+        framing: the whole body, from the waist, or from the collarbones up.
         motion: names of ``LAYERS`` joined by '+', or a BVH file's path; empty for what suits the framing.
         frames: how many.
         size: pixels, both sides of the picture.
@@ -32,56 +60,33 @@ class MannequinSpec:
         identity: seed of shape, joint and face offsets, clothes, hair and colours; 0 is a person too.
         noise: the detector's error on seen points, 1 for a good detector, 0 for none.
         hand_failures: the part of the frames in which a hand's detection begins to fail.
-        detector: one of ``DETECTORS``, whose errors the keypoints have; see ``detector.py``.
+        detector: whose errors the keypoints have; see ``detector.py``.
         views: names of ``VIEWS`` that are filmed as well.
         view_stride: every how many frames the views are filmed.
     """
 
-    framing: str = "full"
+    framing: Framing = "full"
     motion: str = ""
-    frames: int = 60
-    size: int = 256
-    fps: float = 25.0
-    seed: int = 0
-    identity: int = 0
-    noise: float = 1.0
-    hand_failures: float = 0.03
-    detector: str = "mediapipe"
-    views: tuple[str, ...] = ()
-    view_stride: int = 10
+    frames: FilmedFrames = 60
+    size: Side = 256
+    fps: FrameRate = 25.0
+    seed: Seed = 0
+    identity: Seed = 0
+    noise: Noise = 1.0
+    hand_failures: Fraction = 0.03
+    detector: Detector = "mediapipe"
+    views: tuple[UnseenView, ...] = ()
+    view_stride: Count = 10
 
-    def __post_init__(self) -> None:
-        """ValueError where a value makes no sense."""
-        if self.framing not in FRAMINGS:
-            raise ValueError(
-                f"the mannequin's framing must be one of {', '.join(FRAMINGS)}, not {self.framing!r}"
-            )
-        if self.detector not in DETECTORS:
-            raise ValueError(
-                f"the mannequin's detector must be one of {', '.join(DETECTORS)}, not {self.detector!r}"
-            )
-        unknown = [] if self.is_bvh else [name for name in self.layers if name not in LAYERS]
-        if unknown:
-            raise ValueError(
-                f"the mannequin has no motion {unknown[0]!r}: name a .bvh file, or {', '.join(LAYERS)}"
-            )
-        for name, least in (("frames", 2), ("size", 32), ("view_stride", 1), ("seed", 0), ("identity", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(
-                    f"the mannequin's {name} must be at least {least}, not {getattr(self, name)}"
-                )
-        if self.fps <= 0 or self.noise < 0 or not 0 <= self.hand_failures <= 1:
-            raise ValueError(
-                "the mannequin's fps must be positive, noise at least 0, hand_failures in [0, 1]"
-            )
-        for name in self.views:
-            if name not in VIEWS:
-                raise ValueError(f"the mannequin has no view {name!r}, only {', '.join(VIEWS)}")
+    @model_validator(mode="after")
+    def _knows_its_motion(self) -> MannequinSpec:
+        check_motion(self.motion)
+        return self
 
     @property
     def is_bvh(self) -> bool:
         """Whether ``motion`` is a motion-capture file."""
-        return self.motion.lower().endswith(".bvh")
+        return is_bvh(self.motion)
 
     @property
     def layers(self) -> tuple[str, ...]:

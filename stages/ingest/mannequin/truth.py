@@ -27,6 +27,7 @@ from pipeline.body import (
     Poses,
     expression_offsets,
     joint_transforms,
+    linear_blend_skinning,
     locate,
     pose_offsets,
     posed_joints,
@@ -34,7 +35,6 @@ from pipeline.body import (
     read_poses,
     rest_joints,
     rest_vertices,
-    skin,
     write_identity,
     write_poses,
 )
@@ -141,7 +141,7 @@ def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple
     if correctives is not None:
         shaped = shaped + correctives
     transforms = joint_transforms(rotation, joints, part.parents)
-    vertices = skin(transforms, part.skinning_weights, shaped)
+    vertices = linear_blend_skinning(transforms, part.skinning_weights, shaped)
     return posed_joints(rotation, joints, part.parents) + shift, vertices + shift
 
 

@@ -1,9 +1,10 @@
-import dataclasses
+from pydantic.dataclasses import dataclass
 
+from pipeline.settings import SETTINGS
 from pipeline.stage import Stage
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class BendSettings:
     angle: float = 1.0
     fail: str = ""  # "user", "bug", "disk", "memory", "killed"

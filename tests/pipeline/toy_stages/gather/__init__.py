@@ -1,9 +1,10 @@
-import dataclasses
+from pydantic.dataclasses import dataclass
 
+from pipeline.settings import SETTINGS
 from pipeline.stage import Stage
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class GatherSettings:
     upper: bool = False  # changes the text
     unused: int = 0  # changes nothing that is published

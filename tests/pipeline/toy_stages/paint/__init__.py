@@ -1,16 +1,13 @@
-import dataclasses
+from pydantic.dataclasses import dataclass
 
+from pipeline.settings import SETTINGS, Fraction, Iterations
 from pipeline.stage import Stage
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class PaintSettings:
-    iterations: int = 3
-    rate: float | None = None
-
-    def __post_init__(self):
-        if self.iterations < 1:
-            raise ValueError(f"paint.iterations must be at least 1, not {self.iterations}")
+    iterations: Iterations = 3
+    rate: Fraction | None = None
 
 
 STAGE = Stage(

@@ -1,9 +1,10 @@
-import dataclasses
+from pydantic.dataclasses import dataclass
 
+from pipeline.settings import SETTINGS
 from pipeline.stage import Loan, Stage
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=SETTINGS)
 class SingSettings:
     tune: str = "hum"  # or a file, or subject:NAME for what another's bend stage made
 

@@ -1,0 +1,1 @@
+"""What a run is told: the command line's request, and the words that several settings share."""

@@ -1,0 +1,81 @@
+"""What a registration's effort buys: error against seconds, for several numbers of steps."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from pipeline.body import joint_index, load_body, pose_body, read_identity, read_poses
+from pipeline.curves import read_curve
+from pipeline.errors import UserError
+from pipeline.studies.variants import Base, Result, run_record
+from pipeline.tables import read_table, vectors
+
+FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0)  # of the base's own number of steps
+SEEN = 2  # the state of a true point that the camera sees (stages/ingest/mannequin/truth.py)
+TRUTH = pa.schema(
+    [("frame", pa.int32()), ("joints", vectors(55 * 3)), ("joint_state", vectors(55, pa.int32()))]
+)
+ANCHOR = "neck"  # in the picture whatever the framing; bodies are aligned there, frame by frame
+
+
+def fit_steps(own: int) -> list[int]:
+    """The numbers of steps that are compared, increasing."""
+    return sorted({max(1, round(own * factor)) for factor in FACTORS})
+
+
+def fit_numbers(base: Base, result: Result) -> dict[str, float | str]:
+    """The time and error of one registration.
+
+    Returns:
+        ``seconds`` of the registration alone; their ``clock``, wall-clock for a version from before processor
+        seconds were noted; ``pixels``, the mean distance of trusted keypoints from where they were detected;
+        ``millimetres``, the mean distance of the joints that the camera sees from the truth, aligned at the
+        neck, NaN where no truth is known.
+    """
+    ingest, fit = result.folders["ingest"], result.folders["fit"]
+    timings = run_record(fit)["timings"]
+    processor = timings.get("registration_cpu_seconds")
+    pixels = read_curve(fit / "curve.parquet", "run the fit stage again").get("pixels", [])
+    return {
+        "seconds": timings.get("registration_seconds", math.nan) if processor is None else processor,
+        "clock": "wall-clock" if processor is None else "processor",
+        "pixels": pixels[-1][1] if pixels else math.nan,
+        "millimetres": truth_error(ingest, fit, base.request.workspace.body_file),
+    }
+
+
+def truth_error(ingest: Path, fit: Path, body_file: Path) -> float:
+    """Mean distance of the fitted joints from a mannequin's, millimetres; NaN where there is no truth."""
+    if not (ingest / "truth_points.parquet").is_file():
+        return math.nan
+    truth = read_table(ingest / "truth_points.parquet", TRUTH, "run the ingest stage again")
+    body, poses = load_body(body_file), read_poses(fit / "poses.parquet")
+    identity = read_identity(fit / "identity.safetensors", body)
+    _, joints = pose_body(body, identity, poses.rotation, poses.expression, poses.transl)
+    rows = pd.Index(truth["frame"]).get_indexer(list(poses.frames))
+    if (rows < 0).any():
+        raise UserError(f"{fit / 'poses.parquet'} has frames without truth: run the fit stage again")
+    seen = truth["joint_state"][rows] == SEEN
+    true = truth["joints"].reshape(-1, 55, 3)[rows]
+    return 1e3 * aligned_error(joints.numpy(), true, seen, joint_index(ANCHOR))
+
+
+def aligned_error(joints: np.ndarray, true: np.ndarray, seen: np.ndarray, anchor: int) -> float:
+    """The mean distance of seen joints once both bodies have their ``anchor`` in one place.
+
+    Args:
+        joints, true: [T, 55, 3], metres.
+        seen: [T, 55] bool.
+        anchor: a joint's row.
+
+    Returns:
+        Metres; NaN where nothing is seen.
+    """
+    away = (joints - joints[:, anchor, None]) - (true - true[:, anchor, None])
+    distances = np.linalg.norm(away, axis=-1)[seen]
+    return float(distances.mean()) if len(distances) else math.nan

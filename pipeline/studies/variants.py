@@ -1,0 +1,221 @@
+"""Variants of one subject's settings: each is made as versions in the store, and its scores are read back.
+
+A variant is a set of overrides, setting's name -> text, on top of the study's base. What two variants share
+(footage, fit, a whole avatar that is only evaluated differently) is made once, because the store finds it by
+its key; for the same reason an interrupted study goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.artifact import RUN
+from pipeline.config.request import Request
+from pipeline.errors import UserError
+from pipeline.job import Found, Job, open_job
+from pipeline.process import make_results
+
+Overrides = Mapping[str, str]
+"""Setting's name -> text, as on the command line."""
+
+SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
+
+SCALES: Mapping[str, Overrides] = {
+    "preset": {},
+    "small": {"train.iterations": "200", "train.subdivisions": "0"},
+}
+"""``scale=`` -> its overrides; those of the command line win over them."""
+
+LEAN = {
+    "turntable_frames": "2",
+    "training_frames": "1",
+    "comparison_frames": "1",
+    "baseline_frames": "20",
+    "mesh_frames": "0",
+    "second_mask": "off",
+    "slider_frames": "0",
+    "motion_frames": "0",
+}
+"""Settings of evaluate that leave out what no study shows, where there is such a setting."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One row of a study.
+
+    Attributes:
+        name: for the tables.
+        overrides: settings that differ from the study's base.
+    """
+
+    name: str
+    overrides: Overrides = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One variant's scores and times, or why it failed.
+
+    Attributes:
+        subject: whose avatar.
+        variant: its name.
+        failure: the reason in a line; empty where it did not fail. Then all below is empty.
+        means: split -> method -> metric -> mean over frames, as in summary.json; empty without evaluate.
+        gaussians: of the avatar; 0 without evaluate.
+        seconds: stage -> wall-clock seconds of the run that made its version.
+        cpu_seconds: stage -> processor seconds of all threads of it, less what compiling took.
+        folders: stage -> where its version lies.
+    """
+
+    subject: str
+    variant: str
+    failure: str = ""
+    means: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    gaussians: int = 0
+    seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    cpu_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    folders: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+
+    def held_out(self, method: str = "avatar") -> dict[str, float]:
+        """Metric -> mean over the held-out frames, of the metrics that have one."""
+        means = self.means.get("test", {}).get(method, {})
+        return {metric: float(value) for metric, value in means.items() if value is not None}
+
+    @property
+    def line(self) -> str:
+        """One line for the terminal."""
+        if self.failure:
+            return f"{self.subject}, {self.variant}: failed: {self.failure}"
+        psnr, seconds = self.held_out().get("psnr", math.nan), self.cpu_seconds.get("train", math.nan)
+        numbers = f"{psnr:.2f} dB, {self.gaussians:,} Gaussians, trained in {seconds:.0f} processor seconds"
+        return f"{self.subject}, {self.variant}: {numbers}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Base:
+    """One subject's request that a study's variants override, and where its stages write their lines.
+
+    Attributes:
+        subject: whose avatar.
+        request: the study's own settings and places.
+        log: a file for the stages' lines.
+        preset: the preset that the base is, unchanged; empty where settings differ from one.
+    """
+
+    subject: str
+    request: Request
+    log: Path
+    preset: str = ""
+
+    def job(self, overrides: Overrides | None = None) -> Job:
+        """The job of a variant; UserError where a setting is wrong."""
+        return open_job(self.subject, self.request.override(overrides or {}))
+
+    @functools.cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """Stage -> settings of the base itself."""
+        return self.job().settings
+
+    def missing(self, stage: str, overrides: Overrides) -> list[str]:
+        """The stages up to one that the store does not hold."""
+        job = self.job(overrides)
+        found: Found = {}
+        return [name for name in job.upstream_first([stage]) if job.find(name, found) is None]
+
+    def run(self, variant: Variant, stages: Iterable[str] | None = None) -> Result:
+        """Makes what the store lacks of a variant and reads its scores; a failure is returned, not raised.
+
+        Args:
+            variant: overrides on top of the base's.
+            stages: how far to go, as for ``make_results``.
+        """
+        try:
+            versions = make_results(self.job(variant.overrides), stages, self.log)
+            return read_result(self.subject, variant.name, {n: one.folder for n, one in versions.items()})
+        except (UserError, OSError) as error:
+            return Result(self.subject, variant.name, str(error))
+
+    def under_preset(self, preset: str) -> Base:
+        """The same subject and places under a preset's own settings."""
+        request = dataclasses.replace(self.request, preset=preset, overrides={})
+        return Base(self.subject, request, self.log, preset)
+
+
+def base_of(subject: str, request: Request, log: Path, defaults: Overrides | None = None) -> Base:
+    """A study's base: the request, on top of its scale, a lean evaluate and a curve of ten points.
+
+    Args:
+        subject: whose avatar.
+        request: the command line's.
+        log: a file for the stages' lines.
+        defaults: overrides that everything else wins over.
+
+    Raises:
+        UserError: a setting or the scale is wrong.
+    """
+    own = {**scale_overrides(request), **request.overrides}
+    settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
+    lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
+    train = settings.get("train")
+    if hasattr(train, "held_out_every"):
+        lean["train.held_out_every"] = str(min(train.held_out_every, max(1, train.iterations // 10)))
+    changed = any(not name.startswith("evaluate.") for name in own)
+    full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
+    return Base(subject, full, log, "" if changed else request.preset)
+
+
+def scale_overrides(request: Request) -> Overrides:
+    """The overrides that ``scale=`` stands for; UserError where there is no such scale."""
+    if request.scale not in SCALES:
+        raise UserError(f"scale={request.scale}: there is no such scale; there are {', '.join(SCALES)}")
+    return SCALES[request.scale]
+
+
+def study_folder(request: Request, kind: str, name: str) -> Path:
+    """The folder for a study's tables, plots and page; it is made."""
+    folder = request.workspace.data / "studies" / kind / name
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Result:
+    """The scores and times that published versions hold.
+
+    Args:
+        subject, variant: names for the tables.
+        folders: stage -> its version.
+    """
+    records = {stage: run_record(folder) for stage, folder in folders.items()}
+    summary = {"means": {}, "gaussians": 0}
+    if "evaluate" in folders:
+        summary = json.loads((folders["evaluate"] / SUMMARY).read_text(encoding="utf-8"))
+    return Result(
+        subject=subject,
+        variant=variant,
+        means=summary["means"],
+        gaussians=summary["gaussians"],
+        seconds={stage: record["seconds"] for stage, record in records.items()},
+        cpu_seconds={stage: cpu_seconds(record) for stage, record in records.items()},
+        folders=folders,
+    )
+
+
+def run_record(folder: Path) -> dict[str, Any]:
+    """Times and machine of the run that made a version."""
+    return json.loads((folder / RUN).read_text(encoding="utf-8"))
+
+
+def cpu_seconds(record: Mapping[str, Any]) -> float:
+    """Processor seconds of a run, less those of compiling, for the first run of a study pays that for all.
+
+    Those of runs that were killed before it are counted up to the checkpoint that it went on from.
+    """
+    timings = record.get("timings", {})
+    more = timings.get("earlier_cpu_seconds", 0.0) - timings.get("compile_cpu_seconds", 0.0)
+    return record.get("cpu_seconds", math.nan) + more
