@@ -19,7 +19,7 @@ from pipeline.settings import (
     setting,
 )  # fmt: skip
 from stages.ingest.layouts import Layout
-from stages.ingest.mannequin.spec import Detector, FilmedFrames, Framing, Noise, View, check_motion
+from stages.ingest.mannequin.spec import Detector, FilmedFrames, Framing, Noise, UnseenView, check_motion
 
 TestFraction = Annotated[float, Field(ge=0, le=0.9)]
 Focal = Annotated[float, Field(ge=0.1, le=100)]
@@ -95,7 +95,7 @@ class IngestSettings:
     mannequin_hand_failures: Fraction = setting(
         0.03, "the part of frames in which a hand's detection begins to fail"
     )
-    mannequin_views: tuple[View, ...] = setting((), "unseen cameras that are filmed too")
+    mannequin_views: tuple[UnseenView, ...] = setting((), "unseen cameras that are filmed too")
     mannequin_view_stride: Count = setting(10, "every how many frames they are filmed")
 
     @model_validator(mode="after")
