@@ -41,7 +41,7 @@ from pipeline.body import (
     rest_vertices,
 )
 from pipeline.body.landmarks import join
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.face_offset import spread_matrix
 from stages.fit.parameters import Parameters, landmark_model, parameters_of
 from stages.fit.registration import register

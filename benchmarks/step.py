@@ -29,8 +29,8 @@ from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.body import Pose
-from pipeline.camera import Camera
-from pipeline.composite import over
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import over
 from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses

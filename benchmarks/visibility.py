@@ -27,13 +27,13 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.avatar.visibility import evidence_threshold
+from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
-from pipeline.plan import EFFECTS, Plan, read_plan
+from pipeline.run.job import Job, open_job
 from pipeline.splat import render
-from pipeline.visibility import evidence_threshold
 from stages.plan.measure import read_inputs, visibility
 from stages.train import run as training
 from stages.train.apply_plan import apply_plan

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import joint_transforms
-from pipeline.camera import Camera, facing_camera, project
-from pipeline.composite import composite_frame
-from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.records import read_cameras
+from pipeline.clip.camera import Camera, facing_camera, project
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import read_frame, read_mask, write_png
+from pipeline.clip.records import read_cameras
 from pipeline.splat import Rendering, render
-from pipeline.visibility import body_in_frame
 from stages.train.loop import Trainer
 from stages.train.settings import TrainSettings
 

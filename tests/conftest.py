@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # a worker a core; tests that are about threads ask for two
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the processes that tests start
     import numba
     import torch
 
-    numba.get_num_threads()  # its pool sets torch's number of threads when it starts (pipeline.threads)
+    numba.get_num_threads()  # its pool sets torch's number of threads when it starts (pipeline.numba_kernels)
     torch.set_num_threads(1)
 
 

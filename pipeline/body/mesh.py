@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera, project, to_camera
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.numba_kernels import exact_kernel
 
 _NEAREST = 0.01  # metres; triangles that reach nearer to the camera are not drawn
 
@@ -173,7 +173,7 @@ def _lambert(camera: Camera, normals: Tensor) -> np.ndarray:
     return (0.2 + 0.8 * (normals @ towards).abs()).cpu().numpy().astype(np.float32)
 
 
-@numba.njit(cache=True)
+@exact_kernel
 def _rasterize(pixels, depth, usable, faces, face_out, barycentrics_out, depth_out):  # pragma: no cover
     """Fill the three pictures; loops over faces, then over the pixels of each one's box."""
     height, width = face_out.shape
@@ -210,7 +210,7 @@ def _rasterize(pixels, depth, usable, faces, face_out, barycentrics_out, depth_o
                     barycentrics_out[y, x, 2] = w * z
 
 
-@numba.njit(cache=True)
+@exact_kernel
 def _interpolate(face, barycentrics, faces, attribute, out):  # pragma: no cover
     height, width = face.shape
     for y in range(height):

@@ -2,14 +2,12 @@
 
 Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018;
 backbones AlexNet and VGG16 with the heads of version 0.1. The checkpoints are pickles of numpy
-arrays (``data/assets.toml``, asset ``lpips``); the unpickler admits arrays and plain containers and
-refuses everything else.
+arrays (``data/assets.toml``, asset ``lpips``), read as every foreign pickle (``pipeline.untrusted``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.errors import UserError
+from pipeline.untrusted import parse_pickle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,37 +153,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         UserError: the file is missing, damaged, or asks for anything beyond numpy arrays.
     """
     try:
-        with path.open("rb") as file:
-            checkpoint = _ArrayUnpickler(file).load()
+        checkpoint = parse_pickle(path.read_bytes())
     except OSError as error:
         why = f"cannot be read ({error.strerror})"
         raise UserError(f"{path} {why}: run again, and it is fetched anew") from error
-    # A damaged pickle can fail in any way that the opcodes of the pickle machine can fail.
-    except Exception as error:
+    except Exception as error:  # a damaged pickle raises nearly anything
         raise _damaged(path, str(error)) from error
     if not isinstance(checkpoint, dict):
         raise _damaged(path, "it holds no table of arrays")
     return checkpoint
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """Builds numpy arrays, their types, and the containers that need no import."""
-
-    _ADMITTED = {
-        ("numpy.core.multiarray", "_reconstruct"),
-        ("numpy._core.multiarray", "_reconstruct"),
-        ("numpy", "ndarray"),
-        ("numpy", "dtype"),
-        ("_codecs", "encode"),
-    }
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in self._ADMITTED:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}, which no table of arrays needs")
-        if name == "_reconstruct":
-            # numpy 2 moved it; the old name still works there but warns.
-            module = "numpy._core.multiarray"
-        return super().find_class(module, name)
 
 
 def _convolutions(arrays: Mapping[str, Any], backbone: _Backbone) -> list[nn.Conv2d]:

@@ -20,10 +20,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pipeline.numba_kernels import checked_kernel, checked_parallel_kernel, inline_kernel, use_torch_threads
+
 TAPS, REACH = 11, 5  # pixels, of the window and to either side of its middle
 BAND = 32  # rows
 MEANS = 4  # of the image, the target, the sum of their squares, their product
-FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # never "nnan" or "ninf": what is not finite must show
 
 
 def fused_ssim_loss(
@@ -45,7 +46,7 @@ def fused_ssim_loss(
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, window: Tensor, constants: Any) -> Tensor:
-        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+        use_torch_threads()
         x, y = (one.detach().contiguous().numpy() for one in (image, target))
         rows, channels = len(x), np.uint64(x.shape[2])
         flat, taps = (x.reshape(rows, -1), y.reshape(rows, -1)), window.numpy()
@@ -66,14 +67,14 @@ class _Ssim(torch.autograd.Function):
         return ctx.saved_tensors[0] * push, None, None, None
 
 
-@numba.njit(fastmath=FAST, inline="always")
+@inline_kernel
 def _mirrored(place, length):
     """A row or column beyond the border, mirrored at the outermost one."""
     place = abs(place)
     return place if place < length else 2 * (length - 1) - place
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _along_row(wide, taps, channels, narrow):
     """The window over a row that is 5 pixels wider on either side."""
     a, b, c, d, e, f = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
@@ -89,7 +90,7 @@ def _along_row(wide, taps, channels, narrow):
         )
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _across_rows(band, first, taps, row):
     """The window down the columns of a band [rows, C W], over its rows from ``first`` on."""
     a, b, c, d, e, f = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
@@ -105,7 +106,7 @@ def _across_rows(band, first, taps, row):
         )
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _widen(row, channels, wide):
     """A row with 5 mirrored pixels on either side."""
     width = row.shape[0] // channels
@@ -118,7 +119,7 @@ def _widen(row, channels, wide):
             wide[(width + REACH + k) * channels + c] = row[right * channels + c]
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _row_means(x, y, taps, channels, wide, band, place):
     """The four quantities of one row of the images, averaged along it."""
     _widen(x, channels, wide[0])
@@ -130,7 +131,7 @@ def _row_means(x, y, taps, channels, wide, band, place):
         _along_row(wide[mean], taps, channels, band[mean, place])
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _row_value(means, c1, c2):
     """The sum of the similarities of a row of pixels."""
     total = c1 - c1
@@ -143,7 +144,7 @@ def _row_value(means, c1, c2):
     return total
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _row_slopes(means, c1, c2, of_mean, of_squares, of_product):
     """The derivatives of a row's similarities with respect to three of their means."""
     one = c1 / c1
@@ -159,7 +160,7 @@ def _row_slopes(means, c1, c2, of_mean, of_squares, of_product):
         of_product[i] = (n1 + n1) * i1 * i2
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def similarity(x, y, taps, channels, c1, c2, wanted, sums, slopes):
     """The structural similarity of two images.
 
@@ -190,13 +191,13 @@ def similarity(x, y, taps, channels, c1, c2, wanted, sums, slopes):
                 _row_slopes(means, c1, c2, slopes[0, row], slopes[1, row], slopes[2, row])
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _add_row(row, factor, total):
     for i in range(np.uint64(total.shape[0])):
         total[i] += factor * row[i]
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _gather_rows(slope, place, taps, total):
     """What reaches row ``place`` of the image, mirrored ones included, down the columns."""
     rows = slope.shape[0]
@@ -212,7 +213,7 @@ def _gather_rows(slope, place, taps, total):
                 _add_row(slope[row], taps[tap], total)
 
 
-@numba.njit(fastmath=FAST, cache=True)
+@checked_kernel
 def _gather_along(row, taps, channels, padded, wide, total):
     """The transposed window along a row, mirrored pixels folded back.
 
@@ -234,7 +235,7 @@ def _gather_along(row, taps, channels, padded, wide, total):
             total[right * channels + c] += wide[(width + REACH + k) * channels + c]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
+@checked_parallel_kernel
 def pull_back(x, y, taps, channels, slopes, factor, gradient):
     """The gradient of the image from the derivatives with respect to local means.
 

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pipeline.camera import Camera
-from pipeline.splat.blend import Limits, blend_backward, blend_forward, make_limits, sum_weights
+from pipeline.clip.camera import Camera
+from pipeline.numba_kernels import use_torch_threads
+from pipeline.splat.blending import Limits, blend_backward, blend_forward, make_limits, sum_weights
 from pipeline.splat.gaussians import Gaussians, Rendering
 from pipeline.splat.lens import Lens, make_lens
-from pipeline.splat.project import (
+from pipeline.splat.projection import (
     CAMERA_CHUNKS,
     DEPTH,
     GRADIENT_WIDTH,
@@ -70,7 +71,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quaternions, scales, colors, opacities, rotation, translation, lens):
-        _use_torch_threads()
+        use_torch_threads()
         gaussians = [_array(tensor) for tensor in (means, quaternions, scales, colors, opacities)]
         drawing = _draw(gaussians, (_array(rotation.double()), _array(translation.double())), lens)
         color, depth, transmittance = (torch.from_numpy(array) for array in drawing.image)
@@ -84,7 +85,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, g_color, g_alpha, g_depth, _):
-        _use_torch_threads()
+        use_torch_threads()
         means, quaternions, scales = (_array(tensor) for tensor in ctx.saved_tensors[:3])
         drawing: _Drawing = ctx.drawing
         slots = np.zeros((len(drawing.member_weights), GRADIENT_WIDTH), means.dtype)
@@ -130,8 +131,3 @@ def _draw(gaussians: list[np.ndarray], pose: tuple[np.ndarray, np.ndarray], lens
 def _array(tensor: Tensor) -> np.ndarray:
     """The tensor as a contiguous array, which is the one layout that kernels are compiled for."""
     return tensor.detach().contiguous().numpy()
-
-
-def _use_torch_threads() -> None:
-    """Give numba as many threads as torch has, so that there is one number to set."""
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]

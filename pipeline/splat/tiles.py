@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.splat.kernels import kernel
+from pipeline.numba_kernels import kernel
 
 # A tile's side in pixels: a row of a tile is one vector of sixteen lanes, or two of eight, ...
 TILE = 16

@@ -16,15 +16,15 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.artifact import MANIFEST
 from pipeline.config.request import Request
+from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
 from pipeline.run.progress import Progress
-from pipeline.settings import read_toml
+from pipeline.store.artifact import MANIFEST
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import bars
 from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section
-from pipeline.studies.tables import HERE, MAIN, MEAN, NOTE, PAPER, Column, Table
+from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, REGIONS, RUNTIME, Table
 from pipeline.studies.variants import Base, Result, Variant, base_of, scale_overrides, study_folder
 
 FULL, CHANCE, CHANCE_LABEL = "full", "chance", "another seed"
@@ -43,26 +43,9 @@ VARIANTS: Mapping[str, Variant] = {
 }
 """Key -> variant, in the paper's order; another seed comes last."""
 
-IMAGE = (
-    Column("psnr", "PSNR", 2, "higher"),
-    Column("ssim", "SSIM", 4, "higher"),
-    Column("lpips_alex", "LPIPS×100", 2, "lower", 100.0),
-)
-RUNTIME = (
-    Column("gaussians", "#G", 0),
-    Column("asset_mib", "asset MB", 2, "lower"),
-    Column("animation_ms", "animation ms", 1, "lower"),
-    Column("rendering_ms", "rendering ms", 1, "lower"),
-    Column("total_ms", "total ms", 1, "lower"),
-    Column("fps", "frames/s", 1, "higher"),
-)
-REGIONS = tuple(
-    dataclasses.replace(column, key=f"{column.key}_{region}", label=f"{region} {column.label}")
-    for region in ("face", "hands")
-    for column in IMAGE
-)
-EVEN = tuple(dataclasses.replace(column, better="") for column in IMAGE)  # neither row is the better one
-COLUMNS = {"runtime": RUNTIME, "regions": REGIONS, "chance": EVEN}
+LABELS = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: CHANCE_LABEL}
+
+COLUMNS: Mapping[str, Sequence[str]] = {"runtime": list(RUNTIME), "regions": list(REGIONS)}
 CAPTIONS = {
     "runtime": "Processor milliseconds of one thread, the least of 15 frames of the baked avatar in held-out "
     "poses, drawn at 512×512; asset: mean, opacity, scale, rotation and colour in float32.",
@@ -206,8 +189,7 @@ def score_table(
         for one in results.values()
     ]
     index = pd.MultiIndex.from_tuples(list(results), names=["subject", "variant"])
-    columns = [column.key for column in (*IMAGE, *RUNTIME, *REGIONS)]
-    scores = pd.DataFrame(rows, index).reindex(columns=columns).astype(float)
+    scores = pd.DataFrame(rows, index).reindex(columns=[*IMAGE, *RUNTIME, *REGIONS]).astype(float)
     scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
     scores["fps"] = 1e3 / scores["total_ms"]
     return scores
@@ -226,7 +208,7 @@ def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
     return [
         table_of(about, ablation, sizes)
         for about in described
-        if ablation.scores[[c.key for c in COLUMNS.get(about.get("kind"), IMAGE)]].notna().any(axis=None)
+        if ablation.scores[COLUMNS.get(about.get("kind"), list(IMAGE))].notna().any(axis=None)
     ]
 
 
@@ -238,35 +220,34 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
         ablation: its results.
         sizes: a sentence for the caption.
     """
-    columns = list(COLUMNS.get(about.get("kind"), IMAGE))
-    keys = [column.key for column in columns]
+    keys = COLUMNS.get(about.get("kind"), list(IMAGE))
     wanted = [row["variant"] for row in about["rows"]]
-    present = ablation.scores[IMAGE[0].key].unstack()[wanted].notna().all(axis=1)
+    present = ablation.scores["psnr"].unstack()[wanted].notna().all(axis=1)
     counted = [subject for subject in ablation.subjects if present[subject]] or ablation.subjects
-    labels = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: CHANCE_LABEL}
-    rows = {
-        labels[key]: {
-            **ablation.scores.xs(key, level="variant").loc[counted, keys].mean(),
-            NOTE: note_on(key, ablation, counted),
-            MAIN: key == FULL,
-        }
-        for key in wanted
-    }
     same = ablation.dataset and ablation.dataset == about.get("dataset")
-    if same and ("subject" not in about or [about["subject"]] == ablation.subjects):
-        published = [dataclasses.replace(column, source=PAPER) for column in columns]
-        for row in about["rows"]:
-            for column, value in zip(published, row.get("paper", ()), strict=False):
-                rows[labels[row["variant"]]][column.name] = value / column.factor
-        columns += published
+    same = same and ("subject" not in about or [about["subject"]] == ablation.subjects)
+
+    def published(values: Sequence[float]) -> list[float]:
+        return [value / METRICS[key].factor for key, value in zip(keys, values, strict=True)]
+
+    rows = {}
+    for row in about["rows"]:
+        own = ablation.scores.xs(row["variant"], level="variant").loc[counted, keys].mean().to_dict()
+        paper = (
+            dict(zip((f"{PAPER} {key}" for key in keys), published(row["paper"]), strict=True))
+            if same
+            else {}
+        )
+        note = {NOTE: note_on(row["variant"], ablation, counted), MAIN: row["variant"] == FULL}
+        rows[LABELS[row["variant"]]] = own | paper | note
     for row in about.get("published", ()):
         if row["dataset"] == ablation.dataset:
-            values = {c.key: value / c.factor for c, value in zip(columns, row["values"], strict=True)}
-            rows[row["label"]] = {**values, NOTE: "published, on another machine", MAIN: False}
+            values = dict(zip(keys, published(row["values"]), strict=True))
+            rows[row["label"]] = {**values, NOTE: "published, on another machine"}
     poses = ", poses refined on them" if ablation.refined else ""
     caption = CAPTIONS.get(about.get("kind"), f"Means over held-out frames{poses}.")
-    frame = pd.DataFrame.from_dict(rows, orient="index")
-    return Table(about["name"], about["title"], f"{caption} {sizes}", columns, frame)
+    frame, ranked = pd.DataFrame.from_dict(rows, orient="index"), about.get("kind") != "chance"
+    return Table(about["name"], about["title"], f"{caption} {sizes}", frame, ranked=ranked)
 
 
 def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
@@ -298,8 +279,7 @@ def values_of(tables: Sequence[Table], ablation: Ablation) -> pd.DataFrame:
     values = [table.values(MEAN if several else ablation.subjects[0]) for table in tables]
     if several:
         own = ablation.scores.rename_axis(columns="metric").stack().rename("value").reset_index()
-        labels = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: CHANCE_LABEL}
-        own = own.assign(table="each subject", row=own["variant"].map(labels), source=HERE).dropna()
+        own = own.assign(table="each subject", row=own["variant"].map(LABELS), source=HERE).dropna()
         values.append(own[values[0].columns])
     return pd.concat(values, ignore_index=True)
 

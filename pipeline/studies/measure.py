@@ -18,23 +18,24 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from pipeline.assets import require
 from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import load_body, read_poses
-from pipeline.camera import Camera
-from pipeline.composite import BACKGROUNDS, BLACK, composite_frame, over
-from pipeline.digest import write_atomically
-from pipeline.frames import read_frame, read_mask
-from pipeline.job import Job
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame, over
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.records import read_cameras, read_footage, read_split
+from pipeline.config.assets import require
+from pipeline.files.json_files import json_text
 from pipeline.metrics import Lpips
-from pipeline.metrics.protocol import interior
+from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr
 from pipeline.metrics.ssim import ssim
-from pipeline.records import read_cameras, read_footage, read_split
+from pipeline.numba_kernels import threads
+from pipeline.run.job import Job
 from pipeline.splat import Gaussians, render
+from pipeline.store.digest import write_atomically
 from pipeline.studies.variants import Result
-from pipeline.threads import threads
 
 SIDE = 512  # pixels of the picture that speed is measured at
 REPEATS, POSES = 15, 4  # frames that are timed, and poses that they take in turn
@@ -61,7 +62,7 @@ class MeasurementCache:
         """Keeps the finite ones of some numbers, and returns them."""
         self.folder.mkdir(parents=True, exist_ok=True)
         known = {key: value for key, value in numbers.items() if math.isfinite(value)}
-        write_atomically(self.folder / f"{name}.json", json.dumps(known, indent=1, sort_keys=True) + "\n")
+        write_atomically(self.folder / f"{name}.json", json_text(known))
         return known
 
     def get(self, name: str, measure: Callable[[], Mapping[str, float]]) -> Numbers:

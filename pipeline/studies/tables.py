@@ -4,46 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import pandas as pd
 
 HERE, PAPER = "here", "paper"
 MEAN = "mean"  # in place of a subject, for a mean over subjects
 NOTHING = "–"
-NOTE, MAIN = "note", "main"  # further columns of a table's rows
+NOTE, MAIN = "note", "main"  # columns of a table's rows that are no numbers
 
 
 @dataclasses.dataclass(frozen=True)
-class Column:
-    """A number of each row.
+class Metric:
+    """A number as tables show it.
 
     Attributes:
-        key: its name in Parquet.
-        label: of the head, plain text.
+        label: of its column's head, plain text.
         digits: after the point.
         better: ``higher``, ``lower``, or empty where neither is.
         factor: what it is shown times.
-        source: ``here``, or ``paper`` for the figures that it published.
     """
 
-    key: str
     label: str
     digits: int = 2
     better: str = ""
     factor: float = 1.0
-    source: str = HERE
-
-    @property
-    def name(self) -> str:
-        """The column's name in a table's rows."""
-        return self.key if self.source == HERE else f"{self.source} {self.key}"
-
-    @property
-    def head(self) -> str:
-        """The label with its arrow, and with the source where that is the paper."""
-        arrow = {"higher": " ↑", "lower": " ↓"}.get(self.better, "")
-        return f"{'paper: ' if self.source == PAPER else ''}{self.label}{arrow}"
 
     def text(self, value: float) -> str:
         """A number as it is shown."""
@@ -56,6 +41,41 @@ class Column:
         return self.text(values.max() if self.better == "higher" else values.min())
 
 
+IMAGE = {
+    "psnr": Metric("PSNR", 2, "higher"),
+    "ssim": Metric("SSIM", 4, "higher"),
+    "lpips_alex": Metric("LPIPS×100", 2, "lower", 100.0),
+}
+REGIONS = {
+    f"{key}_{region}": dataclasses.replace(metric, label=f"{region} {metric.label}")
+    for region in ("face", "hands")
+    for key, metric in IMAGE.items()
+}
+RUNTIME = {
+    "gaussians": Metric("Gaussians", 0),
+    "asset_mib": Metric("asset MB", 2, "lower"),
+    "animation_ms": Metric("animation ms", 1, "lower"),
+    "rendering_ms": Metric("rendering ms", 1, "lower"),
+    "total_ms": Metric("total ms", 1, "lower"),
+    "fps": Metric("frames/s", 1, "higher"),
+}
+METRICS: Mapping[str, Metric] = {
+    **IMAGE,
+    **REGIONS,
+    **RUNTIME,
+    "psnr_interior": Metric("PSNR inside", 2, "higher"),
+    "train_s": Metric("training s", 0, "lower"),
+    "times": Metric("× base", 2),
+    "gain": Metric("gain dB", 2),
+    "whole_s": Metric("whole job s", 0, "lower"),
+    "short": Metric("short of frontier dB", 2),
+    "seconds": Metric("seconds", 2),
+    "pixels": Metric("px", 3, "lower"),
+    "millimetres": Metric("mm to the truth", 2, "lower"),
+}
+"""Key of a number, as Parquet has it -> the way that tables show it."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Table:
     """A table.
@@ -64,35 +84,45 @@ class Table:
         name: in Parquet and in LaTeX's label.
         title: above it.
         caption: below it: sizes, and how it was measured.
-        columns: in their order.
-        rows: indexed by label, with a column for each of ``columns`` by its name, and optionally ``note``
-            (text beside a row) and ``main`` (whether it stands out).
+        rows: indexed by label; a column for each number, in their order, by its key in ``METRICS``, with
+            ``paper`` and a space before it if the paper published it; and optionally ``note`` (text beside a
+            row) and ``main`` (whether it stands out).
         first: the head of the rows' labels.
+        ranked: whether the best of each column is marked.
     """
 
     name: str
     title: str
     caption: str
-    columns: Sequence[Column]
     rows: pd.DataFrame
     first: str = "variant"
+    ranked: bool = True
 
     @property
     def numbers(self) -> pd.DataFrame:
         """The rows' numbers, NaN where there is none."""
-        return self.rows.reindex(columns=[column.name for column in self.columns]).astype(float)
+        return self.rows.drop(columns=[NOTE, MAIN], errors="ignore").astype(float)
 
     @property
     def texts(self) -> pd.DataFrame:
         """The numbers as they are shown, under their heads."""
-        return pd.DataFrame({c.head: self.numbers[c.name].map(c.text) for c in self.columns}, self.rows.index)
+        return pd.DataFrame({
+            self.head(name): values.map(METRICS[name.split()[-1]].text)
+            for name, values in self.numbers.items()
+        })  # fmt: skip
+
+    def head(self, name: str) -> str:
+        """A column's label with its arrow, and with the source where that is the paper."""
+        source, _, key = name.rpartition(" ")
+        arrow = {"higher": " ↑", "lower": " ↓"}.get(METRICS[key].better, "") if self.ranked else ""
+        return f"{f'{source}: ' if source else ''}{METRICS[key].label}{arrow}"
 
     @property
     def best(self) -> pd.DataFrame:
         """Whether each number is its column's best; of the shape of ``texts``."""
-        return pd.DataFrame(
-            {c.head: self.texts[c.head] == c.best(self.numbers[c.name]) for c in self.columns}
-        )
+        texts = self.texts
+        best = [METRICS[n.split()[-1]].best(v) if self.ranked else None for n, v in self.numbers.items()]
+        return pd.DataFrame({head: texts[head] == one for head, one in zip(texts, best, strict=True)})
 
     @property
     def notes(self) -> list[str]:
@@ -106,13 +136,14 @@ class Table:
 
     def values(self, subject: str) -> pd.DataFrame:
         """A row a finite number: ``table``, ``row``, ``subject``, ``metric``, ``source``, ``value``."""
-        found = [
-            (self.name, label, subject if c.source == HERE else MEAN, c.key, c.source, value)
-            for label, numbers in self.numbers.iterrows()
-            for c, value in zip(self.columns, numbers, strict=True)
-            if math.isfinite(value)
-        ]
-        return pd.DataFrame(found, columns=["table", "row", "subject", "metric", "source", "value"])
+        long = self.numbers.rename_axis(index="row", columns="name").stack().rename("value").reset_index()
+        long = long[long["value"].notna()]
+        paper = long["name"].str.startswith(PAPER)
+        return pd.DataFrame({
+            "table": self.name, "row": long["row"], "subject": paper.map({True: MEAN, False: subject}),
+            "metric": long["name"].str.split().str[-1], "source": paper.map({True: PAPER, False: HERE}),
+            "value": long["value"],
+        })  # fmt: skip
 
 
 def markdown(table: Table) -> str:
@@ -166,7 +197,7 @@ def latex(table: Table) -> str:
         hrules=True,
         position="t",
         position_float="centering",
-        column_format="l" + "r" * len(table.columns),
+        column_format="l" + "r" * len(shown.columns),
         caption=f"{table.title}. {table.caption}".translate(LATEX),
         label=f"tab:{table.name}",
     )

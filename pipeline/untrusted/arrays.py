@@ -12,26 +12,30 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.untrusted.paths import GIGABYTE, bounded_bytes
-from pipeline.untrusted.pickles import load_stubs, plain
+from pipeline.untrusted.paths import GIGABYTE, bounded_bytes, check_unpacked
+from pipeline.untrusted.pickles import parse_pickle
 
-_HEADER = 100_000  # bytes
-_MEMBERS = 10_000
+_MOST_HEADER = 100_000  # bytes
+_MOST_MEMBERS = 10_000
 
 
 def read_npy(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> Any:
-    """What a ``.npy`` file holds: an array of numbers, or the object that was saved as an array.
+    """The content of a ``.npy`` file: an array of numbers, or the object that was saved as an array.
 
     A dictionary that ``np.save`` wrote comes back as a dictionary, an array of objects as a list.
 
     Raises:
         UserError: the file is missing, damaged or too large, or its objects are more than plain data.
     """
-    return _parsed(path, bounded_bytes(path, most_bytes, remedy), remedy)
+    content = bounded_bytes(path, most_bytes, remedy)
+    try:
+        return _parse(content)
+    except Exception as error:  # a damaged file raises nearly anything
+        raise UserError(f"{path} cannot be read as a numpy array ({error}): {remedy}") from None
 
 
 def read_npz(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> dict[str, Any]:
-    """What a ``.npz`` archive holds by name.
+    """The content of a ``.npz`` archive by name.
 
     Raises:
         UserError: as ``read_npy``, or it unpacks to more than is allowed.
@@ -39,34 +43,24 @@ def read_npz(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> dict[str, A
     content = bounded_bytes(path, most_bytes, remedy)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = archive.infolist()
-            if len(members) > _MEMBERS or sum(one.file_size for one in members) > most_bytes:
-                raise UserError(f"{path} unpacks to more than {most_bytes >> 20} MB: {remedy}")
+            check_unpacked(archive, _MOST_MEMBERS, most_bytes)
             return {
-                one.filename.removesuffix(".npy"): _parsed(path, archive.read(one), remedy) for one in members
+                one.filename.removesuffix(".npy"): _parse(archive.read(one)) for one in archive.infolist()
             }
-    except UserError:
-        raise
     except Exception as error:  # a damaged archive raises nearly anything
-        raise UserError(f"{path} is no readable npz archive ({error}): {remedy}") from None
-
-
-def _parsed(path: Path, content: bytes, remedy: str) -> Any:
-    try:
-        return _parse(content)
-    except Exception as error:  # a damaged file raises nearly anything
-        raise UserError(f"{path} cannot be read as a numpy array ({error}): {remedy}") from None
+        raise UserError(f"{path} cannot be read as an npz archive ({error}): {remedy}") from None
 
 
 def _parse(content: bytes) -> Any:
+    # np.load takes the memory that the header claims before it looks how much there is.
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
         raise ValueError(f"version {version} of the format is not known")
-    shape, fortran, dtype = readers[version](file, max_header_size=_HEADER)
+    shape, fortran, dtype = readers[version](file, max_header_size=_MOST_HEADER)
     if dtype.hasobject:
-        return plain(load_stubs(file.read()))
+        return parse_pickle(file.read())
     if dtype.kind not in "biuf":
         raise pickle.UnpicklingError(f"it holds {dtype}, which are no numbers")
     count = math.prod(shape)

@@ -1,7 +1,8 @@
-"""Names that a file gives, and how much of a file is read."""
+"""Names that a file gives, which must stay in their folder, and how much of a file is read."""
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import UserError
@@ -56,3 +57,10 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         raise UserError(f"{path} is missing: {remedy}") from None
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): {remedy}") from None
+
+
+def check_unpacked(archive: zipfile.ZipFile, most_members: int, most_bytes: int) -> None:
+    """Refuse an archive by what it says it unpacks to; ValueError where that is too much."""
+    members = archive.infolist()
+    if len(members) > most_members or sum(one.file_size for one in members) > most_bytes:
+        raise ValueError(f"it unpacks to more than {most_members} files or {most_bytes >> 20} MB")

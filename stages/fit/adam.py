@@ -20,8 +20,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.curves import Curve
-from pipeline.threads import threads
+from pipeline.clip.curves import Curve
+from pipeline.numba_kernels import threads
 from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters

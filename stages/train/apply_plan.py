@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from pipeline.plan import Plan
+from pipeline.clip.plan import Plan
 from stages.train.settings import TrainSettings
 
 RESIDUALS = ("face", "left_hand", "right_hand")

@@ -7,8 +7,9 @@ import dataclasses
 from torch import Tensor
 
 from pipeline.body import Poses
-from pipeline.clip import FittedClip, View, ViewCache, read_fitted_clip
-from pipeline.stage import Context
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.views import View, ViewCache
+from pipeline.run.stage import Context
 from stages.train.generated import GeneratedFrames, joined, read_generated
 
 

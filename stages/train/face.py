@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pipeline.avatar import Canonical
 from pipeline.body.mesh import face_normals, rasterize
-from pipeline.camera import Camera, project, to_camera
+from pipeline.clip.camera import Camera, project, to_camera
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,9 @@ import math
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.curves import Curve
+from pipeline.clip.curves import Curve
 from pipeline.device import moved
-from pipeline.guard import NotFiniteError, finite, require_finite
+from pipeline.finite import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
 from pipeline.metrics.psnr import psnr
 from pipeline.splat import render

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.body import Pose
-from pipeline.clip import View
-from pipeline.composite import over
+from pipeline.clip.composite import over
+from pipeline.clip.views import View
 from pipeline.device import moved
 from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import Rendering, render

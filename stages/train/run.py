@@ -12,16 +12,16 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.body import write_poses
-from pipeline.compiling import CompileTimer, compile_timer
+from pipeline.clip.frames import write_png
+from pipeline.clip.plan import read_plan
+from pipeline.clip.spread import spread_from_start
+from pipeline.config.settings import as_dict
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError
-from pipeline.frames import write_png
 from pipeline.metrics import Lpips
-from pipeline.plan import read_plan
-from pipeline.settings import as_dict
-from pipeline.spread import spread_from_start
-from pipeline.stage import Context
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
+from pipeline.run.compile_timer import CompileTimer, compile_timer
+from pipeline.run.stage import Context
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, read_checkpoint, run_key, write_checkpoint
 from stages.train.data import TrainingData, read_training_data

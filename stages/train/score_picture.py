@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from pipeline.body import BodyModel, Identity, draw_mesh, rest_vertices
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
 
 SIZE = 360  # pixels, of each of the two pictures
 PAPER = 255

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from pipeline.config.choices import Device, LpipsNetwork, ResidualPart, ResidualPlace
-from pipeline.settings import (
+from pipeline.config.settings import (
     SETTINGS,
     Count,
     CountOrNone,

@@ -8,7 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.compiling import CompileTimer
+from pipeline.files.json_files import write_json
+from pipeline.run.compile_timer import CompileTimer
 
 NAME = "timer.json"
 
@@ -68,7 +69,7 @@ class TrainingTimer:
     def save(self, iteration: int) -> None:
         """Stores the marks beside a checkpoint that has just been written."""
         state = {"earlier": self.now(iteration), "marks": self.marks}
-        self._file.write_text(json.dumps(state), encoding="utf-8")
+        write_json(self._file, state)
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:

@@ -5,7 +5,7 @@ That is measured for gated vertices as for all others, by posing the bare body, 
 
 The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
-the captured frames' scores (:mod:`pipeline.visibility`) and what lies below it is gated: it leaves
+the captured frames' scores (:mod:`pipeline.avatar.visibility`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
 that a region that comes into view later returns.
 
@@ -29,12 +29,12 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
 from pipeline.body import Pose
-from pipeline.clip import View, ViewCache
+from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
-from pipeline.records import write_json
-from pipeline.tables import write_table
-from pipeline.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 

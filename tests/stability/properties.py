@@ -16,14 +16,20 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from pipeline.avatar.visibility import (
+    LARGEST_LOSS,
+    evidence_threshold,
+    histogram,
+    otsu_threshold,
+    share_below,
+)
 from pipeline.body import Poses, linear_blend_skinning, uniform_laplacian, vertex_normals
-from pipeline.camera import facing_camera, project
-from pipeline.composite import composite_frame
-from pipeline.guard import finite
+from pipeline.clip.camera import facing_camera, project
+from pipeline.clip.composite import composite_frame
+from pipeline.finite import finite
 from pipeline.metrics import interior, psnr, ssim, ssim_loss
 from pipeline.metrics.ssim import plain_ssim_loss
 from pipeline.splat import Gaussians, render
-from pipeline.visibility import LARGEST_LOSS, evidence_threshold, histogram, otsu_threshold, share_below
 from stages.fit import terms
 from stages.fit.initialise import continuous
 from stages.fit.observations import drop_guesses, visible

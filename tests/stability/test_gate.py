@@ -5,10 +5,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.body import load_body, mean_identity
-from pipeline.errors import UserError
-from pipeline.records import read_json
-from pipeline.visibility import (
+from pipeline.avatar.visibility import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
@@ -18,6 +15,9 @@ from pipeline.visibility import (
     otsu_threshold,
     share_below,
 )
+from pipeline.body import load_body, mean_identity
+from pipeline.clip.records import read_json
+from pipeline.errors import UserError
 from stages.train import run as stage
 from stages.train.visibility_gate import VisibilityGate
 from tests.stability.test_skinning import SMALL

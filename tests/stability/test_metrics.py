@@ -7,7 +7,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.metrics import PSNR_CAP, Lpips, interior, psnr, ssim, ssim_loss
-from pipeline.metrics.identity import identity_cosine
+from pipeline.metrics.face_identity import identity_cosine
 from pipeline.metrics.ssim import plain_ssim_loss
 from stages.train import losses
 from stages.train.perceptual import crop

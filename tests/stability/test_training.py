@@ -9,9 +9,9 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
+from pipeline.clip.frames import frame_path, write_frame, write_mask
 from pipeline.errors import UserError
-from pipeline.frames import frame_path, write_frame, write_mask
-from pipeline.guard import NotFiniteError
+from pipeline.finite import NotFiniteError
 from stages.train import losses, objective, schedule
 from stages.train import run as stage
 from stages.train.checkpoint import NAME, read_checkpoint
@@ -114,7 +114,7 @@ def test_a_damaged_frame_among_good_ones_stops_the_run_by_its_name(subject, tmp_
 
 
 def test_one_frame_and_nothing_held_out(subject, tmp_path):
-    from pipeline.records import Split, write_split
+    from pipeline.clip.records import Split, write_split
 
     place = spoilt(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=()))
@@ -225,7 +225,7 @@ def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
 @pytest.mark.soak
 @pytest.mark.timeout(3000)
 def test_thousands_of_steps_on_one_frame(subject, tmp_path):
-    from pipeline.records import Split, write_split
+    from pipeline.clip.records import Split, write_split
 
     place = spoilt(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=(5,)))

@@ -8,8 +8,8 @@ import pytest
 import roma
 import torch
 
-from pipeline.keypoints import empty_keypoints
-from pipeline.threads import threads
+from pipeline.clip.keypoints import empty_keypoints
+from pipeline.numba_kernels import threads
 from stages.fit import terms
 from stages.fit.face import fit_face
 from stages.fit.face.mesh import densest_half, face_from_mesh

@@ -12,7 +12,7 @@ import scipy.sparse
 import torch
 
 from pipeline.errors import UserError
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 from stages.fit.face import fit_face
 from stages.fit.face.deca import FlameParameters, read_flame_parameters
 from stages.fit.face.flame import correspond, face_from_flame, transfer

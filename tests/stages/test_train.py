@@ -5,15 +5,15 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline import curves
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
-from pipeline.clip import read_fitted_clip
+from pipeline.clip import curves
+from pipeline.clip.fitted_clip import read_fitted_clip
+from pipeline.clip.plan import read_plan
 from pipeline.errors import UserError
-from pipeline.plan import read_plan
+from pipeline.files.tables import read_table
 from pipeline.splat import render
-from pipeline.tables import read_table
 from stages.train import losses, objective
 from stages.train import run as stage
 from stages.train.apply_plan import apply_plan

@@ -5,12 +5,14 @@ import importlib
 import pytest
 import torch
 
-from pipeline import curves
-from pipeline.avatar import heads, load_avatar, posing
+from pipeline.avatar import head as heads
+from pipeline.avatar import load_avatar
+from pipeline.avatar import skinning_tables as posing
 from pipeline.body import Pose, load_body
+from pipeline.clip import curves
 from pipeline.device import moved
+from pipeline.files.tables import read_table
 from pipeline.splat import render
-from pipeline.tables import read_table
 from stages.train import initial_colors, loop, objective, visibility_gate
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from pipeline.body import Poses, read_poses, write_poses
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.records import read_cameras, write_cameras
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask
-from pipeline.records import read_cameras, write_cameras, write_json
-from pipeline.tables import read_table
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import read_table
 from stages.train import run as stage
 from stages.train.generated import GeneratedFrames, read_generated
 from stages.train.visibility_gate import SCHEMA

@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from pipeline.avatar import Avatar
-from pipeline.clip import ViewCache
-from pipeline.records import Split
+from pipeline.clip.records import Split
+from pipeline.clip.views import ViewCache
 from stages.train import run as stage
 from stages.train.data import TrainingData
 from stages.train.objective import Objective

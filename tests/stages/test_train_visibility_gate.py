@@ -8,9 +8,9 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose, load_body
-from pipeline.plan import Decision, Plan
-from pipeline.records import read_json
-from pipeline.tables import read_table
+from pipeline.clip.plan import Decision, Plan
+from pipeline.clip.records import read_json
+from pipeline.files.tables import read_table
 from stages.train import run as stage
 from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME

@@ -12,10 +12,10 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
-from pipeline.camera import facing_camera
-from pipeline.frames import write_frame, write_mask
-from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import render
 from stages.train.settings import TrainSettings
 from tests.plans import plan_of

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from pipeline.compiling import CompileTimer, compile_timer
+from pipeline.run.compile_timer import CompileTimer, compile_timer
 from pipeline.studies.variants import cpu_seconds
 from stages.train.timer import TrainingTimer
 

@@ -7,7 +7,7 @@ from skimage.metrics import structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.metrics.ssim import gaussian_window, plain_ssim_loss, rounded_gaussian_window, ssim, ssim_loss
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from benchmarks.avatars import avatar_of
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Architecture
-from pipeline.threads import threads
+from pipeline.numba_kernels import threads
 
 SMALL = Architecture(plane_resolution=16, plane_channels=4, width=16, groups=4)
 COUNT = 7000  # head, arms and some of the torso of the unsubdivided body

@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.clip.curves import SCHEMA
 from pipeline.config.request import parse_request
-from pipeline.curves import SCHEMA
-from pipeline.settings import read_toml
+from pipeline.config.settings import read_toml
+from pipeline.files.tables import write_table
 from pipeline.studies import ablation
 from pipeline.studies.ablation import (
     CHANCE,
@@ -33,21 +34,18 @@ from pipeline.studies.fit_error import aligned_error
 from pipeline.studies.plots import bars, curves, scatter
 from pipeline.studies.sweep import CHANCE as CHANCE_PARAMETER
 from pipeline.studies.sweep import Level, label_of
-from pipeline.studies.tables import LATEX, MAIN, NOTE, Column, Table, latex, markdown
+from pipeline.studies.tables import LATEX, MAIN, NOTE, Table, latex, markdown
 from pipeline.studies.tradeoff import Tradeoff, plots, point_table, write_tradeoff
 from pipeline.studies.tradeoff import headline as pays
 from pipeline.studies.tradeoff import tables_of as points_of
 from pipeline.studies.variants import Result, base_of
-from pipeline.tables import write_table
 
-METRIC = Column("psnr", "PSNR", 2, "higher")
-SECONDS = Column("s", "time | s", 0, "lower")
 ROWS = {
-    "full": {"psnr": 30.004, "s": 10.0, MAIN: True},
-    "with # {odd} | name\\": {"psnr": 30.001, "s": 9.0, NOTE: "it ~ stopped"},
-    "failed": {NOTE: "failed: no & such file"},
+    "full": {"psnr": 30.004, "train_s": 10.0, MAIN: True},
+    "with # {odd} | name\\": {"psnr": 30.001, "train_s": 9.0, NOTE: "it ~ stopped"},
+    "failed": {NOTE: "failed: no & such | file"},
 }
-TABLE = Table("t", "A & B", "100% of $x$_y", (METRIC, SECONDS), pd.DataFrame.from_dict(ROWS, orient="index"))
+TABLE = Table("t", "A & B", "100% of $x$_y", pd.DataFrame.from_dict(ROWS, orient="index"))
 
 
 def cells_of(text):
@@ -58,15 +56,15 @@ def cells_of(text):
 
 def test_markdown_has_a_row_a_line_and_the_best_in_bold():
     head, _, full, odd, failed = cells_of(markdown(TABLE))
-    assert head == ["variant", "PSNR ↑", "time \\| s ↓", "note"]
+    assert head == ["variant", "PSNR ↑", "training s ↓", "note"]
     assert full == ["**full**", "**30.00**", "10", ""]  # what looks equal is equally good
     assert odd == ["with # {odd} \\| name\\\\", "**30.00**", "**9**", "it ~ stopped"]
-    assert failed == ["failed", "–", "–", "failed: no & such file"]
+    assert failed == ["failed", "–", "–", "failed: no & such \\| file"]
 
 
 def test_a_lone_number_is_not_the_best():
     assert not any(TABLE.best.iloc[2]) and not TABLE.best.isna().any(axis=None)
-    alone = Table("t", "", "", (METRIC,), TABLE.rows.iloc[:1])
+    alone = Table("t", "", "", TABLE.rows.iloc[:1])
     assert not alone.best.any(axis=None) and "**30.00**" not in markdown(alone)
 
 
@@ -89,7 +87,7 @@ def test_latex_closes_what_it_opens_and_has_as_many_cells_everywhere():
     assert len(rows) == 4
     assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {2}
     assert r"\textbf{30.00}" in text and r"with \# \{odd\} \textbar{} name\textbackslash{}" in text
-    assert r"no \& such file" in text and text.rstrip().endswith(r"\end{table}")
+    assert r"no \& such \textbar{} file" in text and text.rstrip().endswith(r"\end{table}")
 
 
 def test_values_are_in_long_form_without_what_is_not_finite():

@@ -7,8 +7,8 @@ import torch
 
 from pipeline.avatar import build_canonical
 from pipeline.body import load_body, mean_identity
-from pipeline.camera import facing_camera
-from pipeline.workspace import REPOSITORY
+from pipeline.clip.camera import facing_camera
+from pipeline.config.workspace import REPOSITORY
 from stages.train import STAGE, regularisers
 from stages.train.face import Pasted, face_loss, face_triangles, paste
 from stages.train.perceptual import crop, due

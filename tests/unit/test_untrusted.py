@@ -12,14 +12,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import scipy.sparse
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.body import read_poses
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_json
 from pipeline.errors import UserError
-from pipeline.keypoints import read_keypoints
-from pipeline.records import read_cameras, read_json
 from pipeline.untrusted import (
     check_picture,
     inside,
@@ -150,6 +151,50 @@ def test_shared_containers_do_not_unroll_without_end(tmp_path):
     (tmp_path / "b.pkl").write_bytes(pickle.dumps(bomb))
     with pytest.raises(UserError, match="unrolls to too much"):
         read_pickle(tmp_path / "b.pkl", REMEDY)
+
+
+def test_shared_arrays_do_not_unroll_without_end(tmp_path):
+    (tmp_path / "b.pkl").write_bytes(pickle.dumps([np.zeros(100_000)] * 100))
+    with pytest.raises(UserError, match="more numbers than is allowed"):
+        read_pickle(tmp_path / "b.pkl", REMEDY, most_bytes=1 << 20)
+
+
+@pytest.mark.parametrize("kind", ["csc_matrix", "csr_matrix"])
+def test_sparse_matrices_are_read_and_may_not_reach_out_of_themselves(tmp_path, kind):
+    matrix = getattr(scipy.sparse, kind)(np.diag([1.0, 2.0, 3.0]))
+    (tmp_path / "s.pkl").write_bytes(pickle.dumps(matrix))
+    np.testing.assert_array_equal(read_pickle(tmp_path / "s.pkl", REMEDY), matrix.toarray())
+    matrix.indices[0] = 1 << 20  # scipy would write there
+    (tmp_path / "s.pkl").write_bytes(pickle.dumps(matrix))
+    with pytest.raises(UserError, match=r"s\.pkl cannot be read"):
+        read_pickle(tmp_path / "s.pkl", REMEDY)
+    matrix = getattr(scipy.sparse, kind)((1 << 24, 1 << 24))  # 2 PB if it were dense
+    (tmp_path / "s.pkl").write_bytes(pickle.dumps(matrix))
+    with pytest.raises(UserError, match=r"s\.pkl cannot be read"):
+        read_pickle(tmp_path / "s.pkl", REMEDY)
+
+
+def test_a_pickle_cannot_change_what_a_name_stands_for(tmp_path):
+    (tmp_path / "e.pkl").write_bytes(b"(lp0\n0c_codecs\nencode\n(N}V__defaults__\n(Vascii\ntstb0N.")
+    (tmp_path / "x.pkl").write_bytes(pickle.dumps(VALUE, 2))
+    assert read_pickle(tmp_path / "e.pkl", REMEDY) is None
+    same(read_pickle(tmp_path / "x.pkl", REMEDY))
+
+
+@pytest.mark.parametrize("damage", ["sum", "storage"])
+def test_a_torch_file_whose_numbers_are_not_what_was_saved_is_refused(tmp_path, damage):
+    torch.save(torch.arange(3.0), tmp_path / "x.pt", _use_new_zipfile_serialization=damage == "sum")
+    content = (tmp_path / "x.pt").read_bytes()
+    raw = torch.arange(3.0).numpy().tobytes()
+    assert content.count(raw) == 1
+    if damage == "sum":
+        content = content.replace(raw, raw[:-1] + b"\x01")
+    else:  # the pickle after the object lists the keys of the storages: none
+        start = content.rindex(b"\x80\x02]")
+        content = content[:start] + b"\x80\x02]." + content[content.index(raw) - 8 :]
+    (tmp_path / "x.pt").write_bytes(content)
+    with pytest.raises(UserError, match=r"x\.pt cannot be read"):
+        read_torch(tmp_path / "x.pt", REMEDY)
 
 
 def peak_while(call):

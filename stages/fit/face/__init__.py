@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 from pipeline.body import BodyModel, Landmarks
-from pipeline.keypoints import Keypoints
-from pipeline.threads import threads
+from pipeline.clip.keypoints import Keypoints
+from pipeline.numba_kernels import threads
 from stages.fit.face.deca import read_flame_parameters
 from stages.fit.face.flame import face_from_flame
 from stages.fit.face.flame_model import load_flame

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
-from stages.fit.face.flame_pickle import read_flame_pickle
+from pipeline.untrusted import GIGABYTE, bounded_bytes, parse_pickled_arrays
 
 SHAPES = 300
 """Columns of ``shapedirs`` that are shape; the rest are expressions."""
@@ -57,7 +57,7 @@ def load_flame(path: Path) -> FlameModel:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path} does not exist: fit.flame_model must be a FLAME model file (npz or pkl)")
-    arrays = _npz(path) if path.suffix.lower() == ".npz" else read_flame_pickle(path)
+    arrays = _npz(path) if path.suffix.lower() == ".npz" else _pickle(path)
     for name in _NAMES:
         if name not in arrays:
             raise UserError(f"{path} has no array {name!r}, so it is no FLAME model: give generic_model.pkl")
@@ -97,3 +97,13 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
             return {name: archive[name] for name in wanted}
     except Exception as error:  # a damaged archive raises nearly anything
         raise UserError(f"{path} cannot be read as npz ({error}): give a FLAME model file") from error
+
+
+def _pickle(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of FLAME's pickle: of Python 2, with scipy's and chumpy's objects in it; 53 MB."""
+    remedy = "give generic_model.pkl, or an npz of it"
+    content = bounded_bytes(path, GIGABYTE, remedy)
+    try:
+        return parse_pickled_arrays(content)
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise UserError(f"{path} cannot be read as a FLAME model ({error}): {remedy}") from error
