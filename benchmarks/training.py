@@ -16,8 +16,8 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body
-from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.clip.composite import composite_frame
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr

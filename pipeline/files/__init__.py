@@ -1,1 +1,1 @@
-"""Files of plain tables and JSON."""
+"""Tables and JSON on disk."""

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from pipeline.body import rasterize, vertex_normals
-from pipeline.clip import FittedClip
 from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.texture.surface import FineSurface
 
 GRAZING = 0.25  # cosine of the angle between normal and view under which nothing is believed

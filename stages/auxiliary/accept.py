@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import Landmarks, Poses, pose_frame, posed_vertices
-from pipeline.clip import FittedClip
 from pipeline.clip.camera import Camera
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.frames import read_mask, write_frame, write_mask
 from stages.auxiliary import check
 from stages.auxiliary.look import Look, Watcher

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 
 from pipeline.body import Poses, read_poses, rest_joints
-from pipeline.clip import FittedClip
 from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import COUNT
 from pipeline.clip.records import read_cameras, read_json
 from pipeline.clip.spread import spread_from_start

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import write_poses
-from pipeline.clip import FittedClip
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.frames import frame_path, write_png
 from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.clip import FittedClip
 from pipeline.clip.boxes import Box
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE
 from pipeline.detection.mediapipe import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from pipeline.body import posed_vertices, write_poses
-from pipeline.clip import FittedClip
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask, write_png
 from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras

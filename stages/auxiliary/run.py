@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import load_landmarks, posed_vertices
-from pipeline.clip import FittedClip
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.plan import read_plan
 from pipeline.errors import UserError
 from stages.auxiliary import texture

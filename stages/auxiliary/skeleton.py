@@ -14,8 +14,8 @@ import numpy as np
 from torch import Tensor
 
 from pipeline.body import Landmarks, locate, pose_frame, rasterize
-from pipeline.clip import FittedClip
 from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from stages.auxiliary.turn import Turn
 

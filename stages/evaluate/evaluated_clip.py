@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Pose, Poses, read_poses
-from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.clip.composite import BLACK, composite_frame
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 
 OTHER_CAMERA_ANGLE = 5.0
 """Degrees about the person between a camera and every training camera, from which it is another one."""

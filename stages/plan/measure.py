@@ -17,9 +17,9 @@ from torch import Tensor
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import PARTS, pose_body
-from pipeline.clip import FittedClip, read_fitted_clip
 from pipeline.clip.boxes import MARGIN
 from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.clip.plan import AZIMUTH_STEP
 from pipeline.clip.records import read_json

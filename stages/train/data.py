@@ -8,7 +8,8 @@ from pathlib import Path
 from torch import Tensor
 
 from pipeline.body import BodyModel, Poses
-from pipeline.clip import FittedClip, View, ViewCache, read_fitted_clip
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.views import View, ViewCache
 from stages.train.generated import GeneratedFrames, joined, read_generated
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.body import Pose
-from pipeline.clip import View
+from pipeline.clip.views import View
 from pipeline.run.progress import Progress
 from stages.train.checkpoint import write_checkpoint
 from stages.train.timer import TrainingTimer

@@ -9,7 +9,7 @@ import torch
 
 from pipeline.avatar import Avatar
 from pipeline.body import Pose
-from pipeline.clip import View
+from pipeline.clip.views import View
 from pipeline.finite import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
 from stages.train import schedule

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, Decoded, Surface
 from pipeline.body import Pose
-from pipeline.clip import View
+from pipeline.clip.views import View
 from pipeline.device import moved
 from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import render

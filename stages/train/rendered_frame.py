@@ -9,8 +9,8 @@ from torch import Tensor
 
 from pipeline.avatar import Decoded, Posed
 from pipeline.avatar.sparse import SparsePair
-from pipeline.clip import View
 from pipeline.clip.composite import over
+from pipeline.clip.views import View
 from pipeline.metrics import Lpips
 from pipeline.splat import Rendering
 from stages.train import losses

@@ -32,7 +32,7 @@ from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.avatar.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
 from pipeline.body import Pose
-from pipeline.clip import View, ViewCache
+from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table

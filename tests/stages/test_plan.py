@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.clip import read_fitted_clip
 from pipeline.clip.camera import facing_camera
+from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.clip.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.clip.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
 from pipeline.clip.records import Split, read_footage, write_footage, write_split

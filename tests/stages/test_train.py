@@ -8,7 +8,8 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
-from pipeline.clip import curves, read_fitted_clip
+from pipeline.clip import curves
+from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table
 from pipeline.splat import render
