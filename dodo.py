@@ -13,7 +13,7 @@
     doit run ablate subject=smile               what each part of the method is worth
     doit run tradeoff subject=smile budget=20m  what accuracy costs in time
 
-What is stale is decided by the store (``pipeline.job``), never by doit's own database, which is not kept.
+What is stale is decided by the store (``pipeline.run.job``), never by doit's own database, which is not kept.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from collections.abc import Callable, Iterable
 
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
-from pipeline import assets as third_party
-from pipeline.artifact import Store
+from pipeline.config import assets as third_party
+from pipeline.config.datasets import known_datasets, subjects_of
 from pipeline.config.request import Request, parse_request
-from pipeline.datasets import known_datasets, subjects_of
+from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
-from pipeline.job import Job, check_settings, open_job, shown, wanted_keys
-from pipeline.process import run_stage_process
-from pipeline.stage import load_stages, usual
-from pipeline.subjects import known_subjects, load_subject
-from pipeline.summary import summarising
-from pipeline.verify import verify
+from pipeline.run.doit_reporter import summarising
+from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
+from pipeline.run.process import run_stage_process
+from pipeline.run.stage import load_stages, usual
+from pipeline.store.artifact import Store
+from pipeline.store.verify import verify
 
 DEFAULT_SUBJECT = "smile"
 
@@ -255,7 +255,7 @@ def task_compare():
 
 def batch_subjects() -> TaskFailed | None:
     """Runs the chosen subjects on a Ray cluster."""
-    from pipeline.batch import run_batch
+    from pipeline.run.ray_batch import run_batch
 
     try:
         outcomes = run_batch(CHOSEN, REQUEST)

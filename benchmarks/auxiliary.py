@@ -25,19 +25,19 @@ import roma
 import torch
 
 from benchmarks import machine
-from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
-from pipeline.boxes import Box, person_box
-from pipeline.camera import Camera
-from pipeline.composite import composite_frame
+from pipeline.clip.boxes import Box, person_box
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import write_frame, write_mask, write_png
+from pipeline.clip.records import read_split, write_cameras
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask, write_png
-from pipeline.job import Job, open_job, run_stage
 from pipeline.metrics import Lpips, psnr, ssim
-from pipeline.records import read_split, write_cameras
+from pipeline.run.job import Job, open_job, run_stage
 from pipeline.splat import render
+from pipeline.store.artifact import Artifact
 from stages.ingest.mannequin.footage import Filming
 from stages.ingest.mannequin.scene import Picture, Scene, film, make_background
 from stages.ingest.mannequin.spec import spec_of

@@ -24,16 +24,16 @@ import torch
 from benchmarks import machine
 from benchmarks.auxiliary import _made, box_of
 from benchmarks.held_out_views import _job
-from pipeline.artifact import Artifact
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body, read_poses
-from pipeline.composite import composite_frame
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import read_frame, read_mask, write_png
+from pipeline.clip.records import read_cameras
+from pipeline.clip.spread import spread_from_start
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_png
 from pipeline.metrics import psnr
-from pipeline.records import read_cameras
 from pipeline.splat import render
-from pipeline.spread import spread_from_start
+from pipeline.store.artifact import Artifact
 
 CAMERAS = (1, 3, 4)
 FRAMES = 4  # that are scored in each camera

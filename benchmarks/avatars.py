@@ -9,8 +9,8 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import BodyModel, Pose, load_body, mean_identity, subdivide
-from pipeline.camera import Camera, facing_camera
-from pipeline.workspace import REPOSITORY
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.config.workspace import REPOSITORY
 
 TRANSL = (0.0, 0.41, -3.0)  # metres: the middle of the open body, three metres before the camera
 LARGEST_LEVEL = 2

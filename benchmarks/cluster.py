@@ -21,8 +21,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.batch import import_ray, without_dashboard
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
+from pipeline.run.ray_batch import import_ray, without_dashboard
 
 SUBJECTS, AT_ONCE, STEPS = 6, 2, 20
 STAGES = "tests.pipeline.toy_stages"

@@ -22,12 +22,12 @@ import numpy as np
 
 from benchmarks.machine import described, prepare
 from benchmarks.training import JudgedClip, trained
+from pipeline.clip.frames import write_png
 from pipeline.config.request import parse_request
-from pipeline.frames import write_png
-from pipeline.job import open_job
 from pipeline.metrics import Lpips
-from pipeline.process import make_results
-from stages.evaluate.scoring import Scorer
+from pipeline.run.job import open_job
+from pipeline.run.process import make_results
+from stages.evaluate.frame_metrics import Scorer
 
 MANNEQUINS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 REAL = ("smile", "oliver", "carphone", "balance")

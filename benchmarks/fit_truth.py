@@ -33,8 +33,8 @@ from pipeline.body import (
     pose_body,
     rasterize,
 )
-from pipeline.camera import Camera, project
-from pipeline.keypoints import Keypoints
+from pipeline.clip.camera import Camera, project
+from pipeline.clip.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from stages.ingest.mannequin import DETECTORS, MannequinSpec
 from stages.ingest.mannequin.detector import detect

@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline.artifact import Artifact
 from pipeline.body import (
     joint_transforms,
     linear_blend_skinning,
@@ -38,13 +37,14 @@ from pipeline.body import (
     rest_joints,
     rest_vertices,
 )
+from pipeline.clip.frames import read_mask
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras
 from pipeline.config.request import parse_request
+from pipeline.config.workspace import open_workspace
 from pipeline.errors import UserError
-from pipeline.frames import read_mask
-from pipeline.job import Job, open_job, run_stage
-from pipeline.keypoints import read_keypoints
-from pipeline.records import read_cameras
-from pipeline.workspace import open_workspace
+from pipeline.run.job import Job, open_job, run_stage
+from pipeline.store.artifact import Artifact
 
 GROUPS = {
     "shoulders": (11, 12), "elbows": (13, 14), "wrists": (15, 16),

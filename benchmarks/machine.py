@@ -9,7 +9,7 @@ import sys
 import numba
 import torch
 
-from pipeline.process import process_environment
+from pipeline.run.process import process_environment
 
 
 def prepare(module: str, threads: int) -> None:

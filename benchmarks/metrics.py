@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from benchmarks import machine
+from pipeline.config.workspace import open_workspace
 from pipeline.metrics import Lpips, interior, psnr, ssim
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.intervals import interval
-from pipeline.workspace import open_workspace
 
 WIDTH, HEIGHT = 512, 288
 FACE = (slice(60, 180), slice(190, 310))  # a crop of 120 pixels

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.scenes import body_camera, body_scene
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.splat import Gaussians, render
 
 # What is drawn: color [H, W, 3], alpha [H, W], depth [H, W].

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.camera import Camera, facing_camera
+from pipeline.clip.camera import Camera, facing_camera
 from pipeline.splat import Gaussians
 
 # The ends of each limb's axis and its radius, metres. Y is up, the body is 1.75 m tall and stands on y = 0.

@@ -26,11 +26,12 @@ from benchmarks.avatars import avatar_of
 from benchmarks.fit_truth import load_stage, make_clips
 from benchmarks.machine import described, prepare
 from benchmarks.step import Contestant, _adam, frames_of
-from pipeline import artifact, tables
 from pipeline.avatar import save_avatar
 from pipeline.body import Poses, write_poses
-from pipeline.guard import finite, require_finite_files
+from pipeline.files import tables
+from pipeline.finite import finite, require_finite_files
 from pipeline.metrics import ssim
+from pipeline.store import artifact
 from stages.fit import adam, parameters
 from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.registration import register

@@ -29,8 +29,8 @@ from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
 from pipeline.body import Pose
-from pipeline.camera import Camera
-from pipeline.composite import over
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import over
 from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
@@ -192,21 +192,26 @@ class Contestant:
 
 def _photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Tensor:
     image = over(rendering.color, rendering.alpha, background)
-    return 0.8 * losses.l1(image, target) + 0.2 * ssim_loss(image, target)
+    return 0.8 * losses.l1(image, target).mean() + 0.2 * ssim_loss(image, target)
 
 
 def _regularisers(decoded: Decoded, posed: Posed) -> Tensor:
     neighbours, colors, pose_offset = decoded.surface.neighbours, posed.gaussians.colors, posed.pose_offset
     assert pose_offset is not None
-    same = 1.0 if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
+    same = None if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
+
+    def roughness(values: Tensor, mask: Tensor | None = None) -> Tensor:
+        return losses.weighted_mean(losses.laplacian(values, neighbours), mask)
+
     smooth = (
-        1e3 * losses.laplacian(decoded.offset, neighbours)
-        + 1e3 * losses.laplacian(pose_offset, neighbours, same)
-        + 0.02 * losses.laplacian(posed.log_scale, neighbours, same)
-        + 0.002 * losses.laplacian(colors, neighbours, same)
+        1e3 * roughness(decoded.offset)
+        + 1e3 * roughness(pose_offset, same)
+        + 0.02 * roughness(posed.log_scale, same)
+        + 0.002 * roughness(colors, same)
     )
-    sizes = losses.l2(posed.gaussians.scales)
-    return smooth + 10 * losses.l2(decoded.offset) + 50 * losses.l2(pose_offset) + 50 * sizes
+    sizes = (decoded.offset, pose_offset, posed.gaussians.scales)
+    offset, pose, scale = (losses.l2(values).mean() for values in sizes)
+    return smooth + 10 * offset + 50 * pose + 50 * scale
 
 
 @torch.no_grad()

@@ -16,17 +16,17 @@ from torch import Tensor
 
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body
-from pipeline.clip import FittedClip, read_fitted_clip
-from pipeline.composite import composite_frame
-from pipeline.job import Job
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.metrics.protocol import interior
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr
-from pipeline.process import make_results
+from pipeline.run.job import Job
+from pipeline.run.process import make_results
+from pipeline.run.stage import Context
 from pipeline.splat import Rendering, render
-from pipeline.stage import Context
 from stages.evaluate.baselines import nearest_frames
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 from stages.train import run as train
 
 CROPS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}

@@ -23,16 +23,16 @@ from benchmarks.machine import described, prepare
 from benchmarks.training import JudgedClip, trained
 from pipeline.avatar import Avatar
 from pipeline.body import Pose
-from pipeline.camera import Camera
-from pipeline.composite import composite_frame
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import write_png
 from pipeline.config.request import parse_request
-from pipeline.frames import write_png
-from pipeline.job import open_job
-from pipeline.metrics.identity import ASSETS, FaceReader, identity_cosine, identity_distance
-from pipeline.process import make_results
+from pipeline.metrics.face_identity import ASSETS, FaceReader, identity_cosine, identity_distance
+from pipeline.orbit_cameras import orbit, visible_extent
+from pipeline.run.job import open_job
+from pipeline.run.process import make_results
 from pipeline.splat import Gaussians, render
-from pipeline.turntable import orbit, visible_extent
-from stages.evaluate.scoring import Scorer
+from stages.evaluate.frame_metrics import Scorer
 
 SUBJECTS = ("smile", "oliver", "carphone", "balance")
 WAYS = {"none": {"auxiliary.generator": "off"}, "texture": {"auxiliary.generator": "texture"}}

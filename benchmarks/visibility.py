@@ -20,27 +20,24 @@ import statistics
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from pipeline.avatar.visibility import evidence_threshold
+from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
-from pipeline.job import Job, open_job
 from pipeline.metrics import Lpips, psnr, ssim
-from pipeline.plan import EFFECTS, Plan, read_plan
+from pipeline.run.job import Job, open_job
 from pipeline.splat import render
-from pipeline.visibility import evidence_threshold
 from stages.plan.measure import read_inputs, visibility
-from stages.train import run as training
-from stages.train.apply_plan import apply_plan
 from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
-from stages.train.poses import PoseRefinement
-from stages.train.settings import TrainSettings
+from stages.train.run import build_trainer
+from stages.train.settings import TrainSettings, apply_plan
 from stages.train.visibility_gate import VisibilityGate
 
 SUBJECTS = ("mannequin_full", "mannequin_upper", "mannequin_head", "smile", "oliver", "balance")
@@ -87,23 +84,14 @@ def open_subject(name: str) -> Subject:
         if artifact is None:
             raise UserError(f"{name} has no {stage} in the store: doit run plan:{name}")
         folders[stage] = artifact.folder
-    context = SimpleNamespace(
-        settings=TrainSettings(), inputs=folders, body_file=job.workspace.body_file, log=lambda line: None
-    )
-    plan = read_plan(folders["plan"] / "plan.json")
-    return Subject(name, job, read_training_data(context), plan, folders)
+    plan, margin = read_plan(folders["plan"] / "plan.json"), TrainSettings().crop_margin
+    data = read_training_data(folders["ingest"], folders["fit"], None, job.workspace.body_file, margin)
+    return Subject(name, job, data, plan, folders)
 
 
 def trainer_of(subject: Subject, settings: TrainSettings, plan: Plan | None = None) -> Trainer:
     """A trainer as the stage makes it."""
-    settings = settings if plan is None else apply_plan(settings, plan)
-    context = SimpleNamespace(inputs=subject.folders, log=lambda line: None)
-    clip = subject.data.clip
-    refinement = PoseRefinement(clip.poses, clip.split.train)
-    avatar, data = training.prepare(subject.data, refinement, settings, context)
-    vertices = len(clip.body.v_template)
-    gate = VisibilityGate(avatar, vertices, settings) if settings.gate else None
-    return Trainer(avatar, refinement, data, settings, gate=gate)
+    return build_trainer(subject.data, settings if plan is None else apply_plan(settings, plan))
 
 
 def scored(subject: Subject, trainer: Trainer, frames: tuple[int, ...], network: Lpips) -> dict[str, float]:
@@ -168,7 +156,8 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
             trainer.step()
         row = {"subject": subject.name, "variant": name, "seconds": time.process_time() - start}
         row |= {"gaussians": len(trainer.avatar), **scored(subject, trainer, frames, network)}
-        threshold = trainer.gate.threshold if trainer.gate is not None else None
+        gate = trainer.hooks.get("gate")
+        threshold = gate.threshold if isinstance(gate, VisibilityGate) else None
         row |= {"tau": threshold.tau if threshold else 0.0}
         row |= {"views": unseen_error(subject, trainer, options.figure)}
         rows.append(row)

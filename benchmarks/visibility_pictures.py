@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import joint_transforms
-from pipeline.camera import Camera, facing_camera, project
-from pipeline.composite import composite_frame
-from pipeline.frames import read_frame, read_mask, write_png
-from pipeline.records import read_cameras
+from pipeline.clip.camera import Camera, facing_camera, project
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import read_frame, read_mask, write_png
+from pipeline.clip.records import read_cameras
 from pipeline.splat import Rendering, render
-from pipeline.visibility import body_in_frame
 from stages.train.loop import Trainer
 from stages.train.settings import TrainSettings
 
@@ -60,7 +60,7 @@ def ghost(subject: Any, trainer: Trainer, folder: Path | None) -> float:
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         image = rendering.color + (1 - rendering.alpha[..., None]) * 0.82
-        name = f"ghost_{subject.name}_{'off' if trainer.gate is None else 'on'}.png"
+        name = f"ghost_{subject.name}_{'on' if 'gate' in trainer.hooks else 'off'}.png"
         write_png(folder / name, (image.clamp(0, 1) * 255).byte().numpy())
     return float(rendering.alpha[~seen].sum())
 
@@ -119,7 +119,7 @@ def gradient_picture(
         trainer = trainer_of(subject, dataclasses.replace(settings, **changes))
         if name == "with":
             trainer.avatar.gate(gated.avatar.active)
-            trainer.gate = None
+            del trainer.hooks["gate"]
         total = torch.zeros(len(only))
         for _ in range(STEPS):
             trainer.step()

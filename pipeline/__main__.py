@@ -11,12 +11,12 @@ import sys
 from pathlib import Path
 
 from pipeline.config.request import parse_request
+from pipeline.config.settings import help_lines, near
+from pipeline.error_messages import explain
 from pipeline.errors import UserError
-from pipeline.explain import explain
-from pipeline.job import open_job, run_stage
-from pipeline.process import leave_reason
-from pipeline.settings import help_lines, near
-from pipeline.stage import load_stages
+from pipeline.run.job import open_job, run_stage
+from pipeline.run.process import leave_reason
+from pipeline.run.stage import load_stages
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

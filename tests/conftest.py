@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # a worker a core; tests that are about threads ask for two
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the processes that tests start

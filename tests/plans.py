@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.plan import EFFECTS, Decision, Plan
+from pipeline.clip.plan import EFFECTS, Decision, Plan
 
 
 def plan_of(**on: bool) -> Plan:

@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.canonical import Canonical, build_canonical
-from pipeline.avatar.heads import Head
-from pipeline.avatar.posing import Rig
+from pipeline.avatar.head import Head
+from pipeline.avatar.nearest_skinning import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.residual import Residuals, regions
-from pipeline.avatar.restrict import active_rows, restricted
-from pipeline.avatar.rows import put, take
-from pipeline.avatar.skin import OWN, nearest_rows, with_weights_of
+from pipeline.avatar.row_selection import put, take
+from pipeline.avatar.skinning_tables import Rig
+from pipeline.avatar.submesh import active_rows, restricted
 from pipeline.avatar.surface import Surface, build_surface, plane_regions
 from pipeline.avatar.triplane import Triplane
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points

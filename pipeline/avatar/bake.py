@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decoded, pose_features
-from pipeline.avatar.fused import Layers, arranged, arranged_rows, finish
-from pipeline.avatar.heads import Head
-from pipeline.avatar.posing import Rig
+from pipeline.avatar.fused_head import Layers, arranged, arranged_rows, finish
+from pipeline.avatar.head import Head
 from pipeline.avatar.residual import encode, time_code
+from pipeline.avatar.skinning_tables import Rig
 from pipeline.body import Pose, joint_transforms
 from pipeline.splat import Gaussians
 

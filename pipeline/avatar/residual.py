@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.canonical import Canonical
-from pipeline.avatar.heads import Head
+from pipeline.avatar.head import Head
 from pipeline.body import PARTS
 from pipeline.config.choices import ResidualPlace
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import HANDS, HEAD, Canonical
-from pipeline.avatar.posing import Rig
 from pipeline.avatar.residual import Region
+from pipeline.avatar.skinning_tables import Rig
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import normalise, region_boxes, sampling
 

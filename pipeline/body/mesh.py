@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera, project, to_camera
+from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.numba_kernels import exact_kernel
 
 _NEAREST = 0.01  # metres; triangles that reach nearer to the camera are not drawn

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
 from pipeline.errors import UserError
-from pipeline.guard import NotFiniteError, rows_not_finite
-from pipeline.tables import open_table
+from pipeline.files.tables import open_table
+from pipeline.finite import NotFiniteError, rows_not_finite
 
 _JOINTS = len(JOINT_NAMES)
 

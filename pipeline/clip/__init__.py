@@ -1,6 +1,1 @@
-"""A subject's clip as every stage after the fit reads it: pictures, cameras and the fitted body."""
-
-from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
-from pipeline.clip.views import View, ViewCache
-
-__all__ = ["FittedClip", "View", "ViewCache", "read_fitted_clip"]
+"""Everything that stages hand on about a clip: frames, cameras, keypoints, masks, the plan."""

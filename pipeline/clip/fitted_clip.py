@@ -26,14 +26,14 @@ from pipeline.body import (
     read_identity,
     read_poses,
 )
-from pipeline.boxes import Box, clip_box
-from pipeline.camera import Camera
+from pipeline.clip.boxes import Box, clip_box
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.keypoints import Keypoints, read_keypoints
+from pipeline.clip.records import Footage, Split, read_cameras, read_footage, read_split
+from pipeline.clip.spread import spread_from_start
 from pipeline.clip.views import View, ViewCache, cropped
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import Keypoints, read_keypoints
-from pipeline.records import Footage, Split, read_cameras, read_footage, read_split
-from pipeline.spread import spread_from_start
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.boxes import Box
-from pipeline.camera import Camera
-from pipeline.composite import composite
+from pipeline.clip.boxes import Box
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import composite
+from pipeline.clip.frames import read_frame, read_mask
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
 
 CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are asked for
 

@@ -32,4 +32,4 @@ Refinement = Literal["plan", "on", "off"]
 """Whether held-out poses are refined on the held-out images: as the plan says, always, never."""
 
 ProtocolName = Literal["ours", "paper", "paper_black"]
-"""Named sets of the three choices before; see ``pipeline.protocols``."""
+"""Named sets of the three choices before; see ``pipeline.config.evaluation_protocol``."""

@@ -14,10 +14,10 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, Strict
 from pydantic.dataclasses import dataclass
 
+from pipeline.config.settings import SETTINGS, near, read_fields, schemas
+from pipeline.config.workspace import Workspace, open_workspace
 from pipeline.errors import UserError
-from pipeline.settings import SETTINGS, near, read_fields, schemas
-from pipeline.stage import Stage, load_stages
-from pipeline.workspace import Workspace, open_workspace
+from pipeline.run.stage import Stage, load_stages
 
 ORIGIN = "the command line"
 DEFAULT_PRESET = "quick"
@@ -106,7 +106,7 @@ def _text(value: object) -> str:
 
 
 def parse_request(words: Iterable[str] | Mapping[str, str], subject: str = "") -> Request:
-    """Reads a command line. Settings are checked where they are resolved (:mod:`pipeline.job`).
+    """Reads a command line. Settings are checked where they are resolved (:mod:`pipeline.run.job`).
 
     Args:
         words: ``["subject=oliver", "train.seed=3"]``, or the same as a mapping.

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.detection.estimator import Estimate
-from pipeline.keypoints import (
+from pipeline.clip.keypoints import (
     BODY,
     FACE,
     FACE_MESH_LEFT_IRIS,
@@ -25,6 +24,7 @@ from pipeline.keypoints import (
     Keypoints,
     empty_keypoints,
 )
+from pipeline.detection.mediapipe import Estimate
 
 POSE_TO_BODY = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 POSE_TO_FEET = (31, 31, 29, 32, 32, 30)  # toes are one point in MediaPipe

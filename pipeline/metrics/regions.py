@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.boxes import Box
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.clip.boxes import Box
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 
 REGIONS = ("face", "hands")
 

@@ -33,7 +33,7 @@ from torch import Tensor
 from pipeline.body import JOINT_NAMES, BodyModel
 from pipeline.errors import UserError
 from pipeline.motion.legs import leg_of
-from pipeline.motion.record import USUAL_FPS, Motion, Span
+from pipeline.motion.motion import USUAL_FPS, Motion, Span
 from pipeline.pose_files.coefficients import is_official_smplx
 from pipeline.untrusted import read_npz
 

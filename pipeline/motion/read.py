@@ -10,15 +10,15 @@ import numpy as np
 import torch
 
 from pipeline.body import JOINT_NAMES, BodyModel, Identity, rest_joints
+from pipeline.clip.spread import spread_end_to_end
 from pipeline.motion.amass import read_amass
 from pipeline.motion.bvh import read_bvh
-from pipeline.motion.fitted import read_fitted
+from pipeline.motion.fitted_motion import read_fitted
 from pipeline.motion.legs import leg_of
-from pipeline.motion.names import MotionName
-from pipeline.motion.peers import read_peers
-from pipeline.motion.record import Motion, Span
+from pipeline.motion.motion import Motion, Span
+from pipeline.motion.motion_name import MotionName
 from pipeline.motion.retarget import match_joints, retarget_rows
-from pipeline.spread import spread_end_to_end
+from pipeline.motion.smplx_json import read_peers
 
 _REFERENCE_FRAMES = 500  # among which the one with the straightest limbs is sought
 

@@ -9,7 +9,7 @@ rest, moved by the root alone, is at
 where J_0 is the root joint of the shaped body at rest: SMPL-X turns about its pelvis, which is not the
 origin. ``trans`` is thus the pelvis' place in the camera minus J_0 (ExAvatar's fit holds the pelvis'
 place and subtracts the root joint when it saves). Here the same point is in the world, Y up for an
-uncalibrated clip (``pipeline.camera.facing_camera``):
+uncalibrated clip (``pipeline.clip.camera.facing_camera``):
 
     x_world = G (x - J_0) + J_0 + transl,    x_camera = R x_world + t,
 

@@ -37,7 +37,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
 from pipeline.body.joints import BODY_POSE, JAW, LEFT_EYE, LEFT_HAND, RIGHT_EYE, RIGHT_HAND
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.pose_files.axes import HAND_JOINTS, into_camera, moved_pivot
 
 _BETAS, _EXPRESSIONS = 100, 50  # what the tools' models are built with

@@ -11,8 +11,8 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera, to_camera
-from pipeline.splat import constants
+from pipeline.clip.camera import Camera, to_camera
+from pipeline.splat import image_formation as constants
 from pipeline.splat.gaussians import Gaussians, Rendering
 
 

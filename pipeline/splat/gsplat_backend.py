@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
-from pipeline.splat import constants
+from pipeline.splat import image_formation as constants
 from pipeline.splat.dense import usable
 from pipeline.splat.gaussians import Gaussians, Rendering
 

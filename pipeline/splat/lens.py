@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.splat import constants
+from pipeline.splat import image_formation as constants
 
 
 class Lens(NamedTuple):

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.numba_kernels import use_torch_threads
-from pipeline.splat.blend import Limits, blend_backward, blend_forward, make_limits, sum_weights
+from pipeline.splat.blending import Limits, blend_backward, blend_forward, make_limits, sum_weights
 from pipeline.splat.gaussians import Gaussians, Rendering
 from pipeline.splat.lens import Lens, make_lens
-from pipeline.splat.project import (
+from pipeline.splat.projection import (
     CAMERA_CHUNKS,
     DEPTH,
     GRADIENT_WIDTH,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.splat.gaussians import Gaussians, Rendering
 
 BACKENDS = ("auto", "numba", "gsplat", "dense")

@@ -16,11 +16,11 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.artifact import MANIFEST
 from pipeline.config.request import Request
+from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
 from pipeline.run.progress import Progress
-from pipeline.settings import read_toml
+from pipeline.store.artifact import MANIFEST
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import bars
 from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section

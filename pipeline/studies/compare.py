@@ -10,14 +10,14 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.artifact import Artifact, Store
+from pipeline.config.datasets import Dataset, load_dataset, subjects_of
+from pipeline.config.evaluation_protocol import ON, OWN, Protocol, chosen
 from pipeline.config.request import Request
-from pipeline.datasets import Dataset, load_dataset, subjects_of
-from pipeline.digest import write_atomically
 from pipeline.errors import UserError
-from pipeline.job import open_job, shown
-from pipeline.protocols import ON, OWN, Protocol, chosen
-from pipeline.stage import usual
+from pipeline.run.job import open_job, shown
+from pipeline.run.stage import usual
+from pipeline.store.artifact import Artifact, Store
+from pipeline.store.digest import write_atomically
 from pipeline.studies.tables import pipe_table
 
 MEAN = "mean"

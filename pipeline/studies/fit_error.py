@@ -10,11 +10,11 @@ import pandas as pd
 import pyarrow as pa
 
 from pipeline.body import joint_index, pose_body
+from pipeline.clip.curves import read_curve
 from pipeline.clip.fitted_clip import read_fitted_clip
-from pipeline.curves import read_curve
 from pipeline.errors import UserError
+from pipeline.files.tables import read_table, vectors
 from pipeline.studies.variants import Base, Result, run_record
-from pipeline.tables import read_table, vectors
 
 FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0)  # of the base's own number of steps
 SEEN = 2  # the state of a true point that the camera sees (stages/ingest/mannequin/truth.py)

@@ -18,22 +18,22 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from pipeline.assets import require
 from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import load_body
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame, over
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
-from pipeline.composite import BACKGROUNDS, BLACK, composite_frame, over
-from pipeline.digest import write_atomically
-from pipeline.job import Job
-from pipeline.json_files import json_text
+from pipeline.config.assets import require
+from pipeline.files.json_files import json_text
 from pipeline.metrics import Lpips
-from pipeline.metrics.protocol import interior
+from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr
 from pipeline.metrics.ssim import ssim
 from pipeline.numba_kernels import threads
+from pipeline.run.job import Job
 from pipeline.splat import Gaussians, render
+from pipeline.store.digest import write_atomically
 from pipeline.studies.variants import Result
 
 SIDE = 512  # pixels of the picture that speed is measured at

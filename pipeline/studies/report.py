@@ -14,10 +14,10 @@ from typing import Any
 import jinja2
 import pandas as pd
 
-from pipeline.artifact import MANIFEST
-from pipeline.digest import write_atomically
-from pipeline.job import shown
-from pipeline.settings import as_dict
+from pipeline.config.settings import as_dict
+from pipeline.run.job import shown
+from pipeline.store.artifact import MANIFEST
+from pipeline.store.digest import write_atomically
 from pipeline.studies.sweep import mesh_of, picture_setting, setting_of
 from pipeline.studies.tables import Table, latex, markdown
 from pipeline.studies.variants import Overrides, Result, run_record

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pipeline.clip.curves import read_curve
 from pipeline.config.request import Request
-from pipeline.curves import read_curve
 from pipeline.errors import UserError
-from pipeline.job import Job
+from pipeline.run.job import Job
 from pipeline.studies.fit_error import fit_numbers, fit_steps
 from pipeline.studies.measure import AvatarMeter, Numbers
 from pipeline.studies.plots import curves, scatter

@@ -15,11 +15,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.artifact import RUN
 from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.job import Found, Job, open_job
-from pipeline.process import make_results
+from pipeline.run.job import Found, Job, open_job
+from pipeline.run.process import make_results
+from pipeline.store.artifact import RUN
 
 Overrides = Mapping[str, str]
 """Setting's name -> text, as on the command line."""

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from pipeline.body import rasterize
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.texture.surface import FineSurface
 
 SAMPLES = 2  # a pixel, in each direction

@@ -1,10 +1,10 @@
 """animate: the avatar in a motion that was never filmed, or turned once, as video, OpenEXR or splats."""
 
-from pipeline.motion.names import borrowed_subject
-from pipeline.stage import Loan, Stage
+from pipeline.motion.motion_name import borrowed_subject
+from pipeline.run.stage import Loan, Stage
 from stages.animate.settings import AnimateSettings
 
-# As pipeline.motion.fitted.READ says, which is too heavy to load here; a test compares them.
+# As pipeline.motion.fitted_motion.READ says, which is too heavy to load here; a test compares them.
 LENT = {
     "ingest": ("footage.json", "cameras.parquet"),
     "fit": ("identity.safetensors", "poses.parquet"),

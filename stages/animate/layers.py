@@ -32,7 +32,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
 from pipeline.splat import Gaussians, Rendering, render
 

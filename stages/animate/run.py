@@ -13,20 +13,20 @@ import torch
 
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
-from pipeline.camera import Camera
-from pipeline.composite import over, to_bytes
-from pipeline.frames import write_png, write_video
-from pipeline.json_files import write_json
-from pipeline.motion.names import TURNTABLE, motion_name
-from pipeline.motion.place import place
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import over, to_bytes
+from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.records import read_cameras, read_split, write_cameras
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.files.json_files import write_json
+from pipeline.motion.motion import Span
+from pipeline.motion.motion_name import TURNTABLE, motion_name
+from pipeline.motion.placement import place
 from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
-from pipeline.motion.record import Span
 from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
-from pipeline.records import read_cameras, read_split, write_cameras
+from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, Rendering, render, write_ply
-from pipeline.spread import spread_end_to_end
-from pipeline.stage import Context
 from stages.animate.actor import Actor, Known, legs_share, make_actor
 from stages.animate.layers import NAMES, layers_of, write_layers
 from stages.animate.script import Script, cameras_of, origin_of, turntable

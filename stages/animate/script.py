@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
-from pipeline.camera import Camera, facing_camera
-from pipeline.motion.place import Placed
-from pipeline.motion.record import Motion
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.motion.motion import Motion
+from pipeline.motion.placement import Placed
+from pipeline.orbit_cameras import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
 from pipeline.splat import Gaussians
-from pipeline.spread import spread_end_to_end
-from pipeline.turntable import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
 from stages.animate.settings import AnimateSettings
 
 _SAMPLES = 24  # frames that are looked at to place a camera

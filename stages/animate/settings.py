@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
-from pipeline.motion.names import TURNTABLE, motion_name
-from pipeline.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
+from pipeline.motion.motion_name import TURNTABLE, motion_name
 
 ColorName = Literal["grey", "black", "white", "green"]
 NAMED_COLORS: Mapping[ColorName, str] = {

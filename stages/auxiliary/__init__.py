@@ -1,6 +1,6 @@
 """Views the camera never saw: guidance for a generator, and what of its frames is fit to learn from."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.auxiliary.settings import AuxiliarySettings
 
 STAGE = Stage(

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import Landmarks, Poses, pose_frame, posed_vertices
-from pipeline.camera import Camera
-from pipeline.clip import FittedClip
-from pipeline.frames import read_mask, write_frame, write_mask
+from pipeline.clip.camera import Camera
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frames import read_mask, write_frame, write_mask
 from stages.auxiliary import check
 from stages.auxiliary.look import Look, Watcher
 from stages.auxiliary.offer import Offer, Picture
@@ -20,7 +20,7 @@ from stages.auxiliary.register import register
 from stages.auxiliary.skeleton import driven_keypoints
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 
 @dataclasses.dataclass(frozen=True)

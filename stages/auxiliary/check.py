@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from pipeline.body import PARTS, Pose, joint_index, joint_orientations, part_labels, rasterize
-from pipeline.camera import Camera
-from pipeline.clip import FittedClip
-from pipeline.keypoints import BODY, FACE
-from pipeline.metrics.identity import identity_distance
+from pipeline.clip.camera import Camera
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.keypoints import BODY, FACE
+from pipeline.metrics.face_identity import identity_distance
 from stages.auxiliary.look import Look
 from stages.auxiliary.register import MIRRORED, POINTS, TRUSTED
 from stages.auxiliary.settings import AuxiliarySettings

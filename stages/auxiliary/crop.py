@@ -11,9 +11,9 @@ from torch import Tensor
 
 from pipeline.body import rasterize
 from pipeline.body.mesh import Raster
-from pipeline.boxes import Box
-from pipeline.camera import Camera, project, to_camera
-from pipeline.clip import FittedClip
+from pipeline.clip.boxes import Box
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip
 from stages.auxiliary.texture import FineSurface
 
 SHOWN = 0.5  # share of the training frames that must have a vertex within their borders

@@ -21,13 +21,13 @@ import numpy as np
 import torch
 
 from pipeline.body import Poses, read_poses, rest_joints
-from pipeline.camera import Camera, facing_camera
-from pipeline.clip import FittedClip
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.keypoints import COUNT
+from pipeline.clip.records import read_cameras, read_json
+from pipeline.clip.spread import spread_from_start
 from pipeline.errors import UserError
-from pipeline.keypoints import COUNT
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
-from pipeline.records import read_cameras, read_json
-from pipeline.spread import spread_from_start
 from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.turn import ID_OFFSET, Turn
 

@@ -19,18 +19,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import write_poses
-from pipeline.clip import FittedClip
-from pipeline.frames import frame_path, write_png
-from pipeline.json_files import write_json
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frames import frame_path, write_png
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.records import write_cameras
+from pipeline.files.json_files import write_json
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import write_cameras
 from stages.auxiliary.reference import Reference
 from stages.auxiliary.skeleton import draw_skeleton
 from stages.auxiliary.turn import Turn
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 FOLDER = "guidance"
 

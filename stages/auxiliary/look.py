@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.boxes import Box
-from pipeline.clip import FittedClip
-from pipeline.detection.estimator import Estimate, Estimator, resize
+from pipeline.clip.boxes import Box
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.keypoints import FACE
+from pipeline.detection.mediapipe import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels
-from pipeline.keypoints import FACE
-from pipeline.metrics.identity import FaceReader, typical
+from pipeline.metrics.face_identity import FaceReader, typical
 from stages.auxiliary.offer import Picture
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 LONGEST = 1280  # pixels of the longer side that the estimator is shown
 THUMB = 64  # pixels, of the small copy's longer side

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from pipeline.body import Poses
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)

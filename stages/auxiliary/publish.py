@@ -10,22 +10,22 @@ import numpy as np
 import torch
 
 from pipeline.body import posed_vertices, write_poses
-from pipeline.camera import Camera
-from pipeline.clip import FittedClip
-from pipeline.composite import composite
-from pipeline.frames import read_frame, read_mask, write_frame, write_mask, write_png
-from pipeline.json_files import write_json
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.camera import Camera
+from pipeline.clip.composite import composite
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.records import write_cameras
+from pipeline.clip.spread import spread_from_start
+from pipeline.files.json_files import write_json
 from pipeline.pictures import side_by_side
-from pipeline.records import write_cameras
-from pipeline.spread import spread_from_start
 from stages.auxiliary.accept import Accepted
 from stages.auxiliary.crop import Framing, crop
 from stages.auxiliary.texture import FineSurface
 from stages.auxiliary.turn import ID_OFFSET
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 NOTHING_NEW = "shows nothing that the clip does not"
 OUT_OF_FRAME = "shows nothing of what the clip frames"

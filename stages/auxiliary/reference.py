@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from pipeline.body import Landmarks, joint_index, joint_orientations, locate, pose_frame
-from pipeline.camera import Camera, project
-from pipeline.clip import FittedClip
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.clip.camera import Camera, project
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from stages.auxiliary.crop import Framing
 from stages.auxiliary.skeleton import driven_keypoints
 from stages.auxiliary.texture import FineSurface, paint

@@ -24,8 +24,8 @@ from pipeline.body import (
     rest_vertices,
 )
 from pipeline.body.joints import BODY_POSE
-from pipeline.camera import Camera, project
-from pipeline.clip import FittedClip
+from pipeline.clip.camera import Camera, project
+from pipeline.clip.fitted_clip import FittedClip
 
 POINTS = slice(0, 23)  # body and feet
 STEPS, RATE = 120, 0.01

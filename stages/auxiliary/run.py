@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import load_landmarks, posed_vertices
-from pipeline.clip import FittedClip
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.plan import read_plan
 from pipeline.errors import UserError
-from pipeline.plan import read_plan
 from stages.auxiliary import texture
 from stages.auxiliary.accept import accept_checked, accept_exact
 from stages.auxiliary.crop import find_framing
@@ -25,7 +25,7 @@ from stages.auxiliary.skeleton import turn_keypoints
 from stages.auxiliary.turn import Turn, make_turn, read_numbered_clip
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 
 def run(context: Context) -> None:

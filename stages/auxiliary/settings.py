@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from pipeline.config.choices import Device
-from pipeline.settings import SETTINGS, Angle, Count, FrameRate, Positive, Seed, setting
+from pipeline.config.settings import SETTINGS, Angle, Count, FrameRate, Positive, Seed, setting
 
 TurnFrames = Annotated[int, Field(ge=4, le=100_000)]
 Scale = Annotated[float, Field(ge=0, le=1000)]

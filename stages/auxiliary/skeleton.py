@@ -14,9 +14,9 @@ import numpy as np
 from torch import Tensor
 
 from pipeline.body import Landmarks, locate, pose_frame, rasterize
-from pipeline.camera import Camera, project, to_camera
-from pipeline.clip import FittedClip
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from stages.auxiliary.turn import Turn
 
 LEAST = 0.3  # the score under which a point is not drawn

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from pipeline.body import JOINT_NAMES, Poses, posed_vertices, rest_joints
-from pipeline.camera import Camera, facing_camera
-from pipeline.clip import FittedClip, read_fitted_clip
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.spread import spread_end_to_end
 from pipeline.errors import UserError
-from pipeline.spread import spread_end_to_end
 from stages.auxiliary.settings import AuxiliarySettings
 
 ID_OFFSET = 100_000

@@ -1,6 +1,6 @@
 """evaluate: numbers, pictures and the report of a finished avatar."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(

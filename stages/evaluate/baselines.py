@@ -1,20 +1,17 @@
-"""What any avatar must be compared with: pictures that need no avatar at all."""
+"""Pictures that need no avatar at all, with which any avatar must be compared: the mean and nearest frame."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property, lru_cache, partial
 
 import torch
 from torch import Tensor
 
-from pipeline.spread import spread_end_to_end
-from stages.evaluate.evidence import Evidence
-from stages.evaluate.judging import Judge, On
-from stages.evaluate.mesh import TexturedMesh
-from stages.evaluate.scoring import MEAN, MESH, NEAREST, Picture, Scorer
-from stages.evaluate.settings import EvaluateSettings
+from pipeline.clip.spread import spread_end_to_end
+from stages.evaluate.evaluated_clip import EvaluatedClip
+from stages.evaluate.methods import MEAN, NEAREST, OnBackground
 
 Person = Callable[[int], Tensor]
 """Frame number -> the person on the background, [H, W, 3] float in [0, 1]."""
@@ -53,64 +50,86 @@ def nearest_frames(person: Person, training: Sequence[int], held_out: Sequence[i
     for start in range(0, len(held_out), _HELD_AT_ONCE):
         chunk = held_out[start : start + _HELD_AT_ONCE]
         truths = [person(index) for index in chunk]
-        errors = torch.tensor([[_error(image, truth) for truth in truths] for image in map(person, training)])
+        errors = torch.tensor(
+            [[_mean_square(image, truth) for truth in truths] for image in map(person, training)]
+        )
         nearest.update(zip(chunk, [training[row] for row in errors.argmin(0).tolist()], strict=True))
     return nearest
 
 
-def _error(image: Tensor, truth: Tensor) -> float:
+def _mean_square(image: Tensor, truth: Tensor) -> float:
     return float((image - truth).square().mean(dtype=torch.float64))
 
 
 @dataclasses.dataclass(frozen=True)
-class Baselines:
-    """What stands beside the avatar on a held-out frame.
+class MeanFrame:
+    """The mean of some training frames, the same picture for every held-out frame.
 
     Attributes:
-        nearest: held-out frame -> its nearest training frame.
-        mean: the mean frame.
-        copied: training frame -> the person in it.
-        mesh: the textured mesh, where it was asked for.
-        evidence: the clip.
-        ready: a key, what is shown -> the same made ready; remembers the last ones.
+        clip: the clip.
+        training: the frames that are averaged.
+        name: ``MEAN``.
     """
 
+    clip: EvaluatedClip
+    training: Sequence[int]
+    name: str = MEAN
+
+    @property
+    def frames(self) -> Collection[int]:
+        """The held-out frames."""
+        return self.clip.split.test
+
+    def render(self, frame: int) -> OnBackground:
+        """The mean."""
+        return self._mean
+
+    @cached_property
+    def _mean(self) -> OnBackground:
+        @lru_cache(maxsize=2)
+        def mean(background: str) -> Tensor:
+            return mean_frame(partial(self.clip.person, background=background), self.training)
+
+        return mean
+
+
+@dataclasses.dataclass(frozen=True)
+class NearestFrame:
+    """For each held-out frame the training frame that is most like it.
+
+    Attributes:
+        clip: the clip.
+        nearest: held-out frame -> training frame.
+        name: ``NEAREST``.
+    """
+
+    clip: EvaluatedClip
     nearest: Mapping[int, int]
-    mean: On
-    copied: Callable[[int], On]
-    mesh: TexturedMesh | None
-    evidence: Evidence
-    ready: Callable[[tuple[str, int]], Picture]
+    name: str = NEAREST
 
-    def pictures(self, judge: Judge) -> Iterator[tuple[str, Picture]]:
-        """Each baseline's method and picture of the frame that is judged now."""
-        frame = judge.truth.frame
-        for key in ((MEAN, 0), (NEAREST, self.nearest[frame])):
-            shown = self.mean if key[0] == MEAN else self.copied(key[1])
-            yield key[0], judge.make(shown) if judge.cuts else self.ready(key)
-        if self.mesh is not None:
-            yield MESH, judge.make(self.mesh.on(self.evidence.pose(frame), self.evidence.cameras[frame]))
+    @property
+    def frames(self) -> Collection[int]:
+        """The held-out frames."""
+        return self.nearest.keys()
+
+    def render(self, frame: int) -> OnBackground:
+        """The person in the nearest training frame."""
+        return self._copied(self.nearest[frame])
+
+    @cached_property
+    def _copied(self) -> Callable[[int], OnBackground]:
+        # Neighbouring held-out frames often share their nearest frame.
+        return lru_cache(maxsize=3)(partial(partial, self.clip.person))
 
 
-def prepare_baselines(
-    evidence: Evidence, scorer: Scorer, settings: EvaluateSettings, mesh: TexturedMesh | None
-) -> Baselines:
-    """Takes the mean of the training frames and finds each held-out frame's nearest."""
-    frames = evidence.split.train
-    training = spread_end_to_end(frames, settings.baseline_frames or len(frames))
+def frame_baselines(clip: EvaluatedClip, background: str, most: int) -> tuple[MeanFrame, NearestFrame]:
+    """The mean and the nearest frame.
 
-    @lru_cache(maxsize=2)
-    def mean(background: str) -> Tensor:
-        return mean_frame(partial(evidence.person, background=background), training)
-
-    def copied(frame: int) -> On:
-        return partial(evidence.person, frame)
-
-    # Neighbouring held-out frames often share their nearest frame.
-    @lru_cache(maxsize=3)
-    def ready(key: tuple[str, int]) -> Picture:
-        return scorer.composited(mean if key[0] == MEAN else copied(key[1]))
-
-    person = partial(evidence.person, background=scorer.background)
-    nearest = nearest_frames(person, training, evidence.split.test)
-    return Baselines(nearest, mean, copied, mesh, evidence, ready)
+    Args:
+        clip: the clip.
+        background: what frames are compared on to find the nearest.
+        most: training frames that both draw from, evenly spaced; 0 for all.
+    """
+    training = spread_end_to_end(clip.split.train, most or len(clip.split.train))
+    person = partial(clip.person, background=background)
+    return MeanFrame(clip, training), NearestFrame(clip, nearest_frames(person, training, clip.split.test))

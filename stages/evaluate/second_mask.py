@@ -1,6 +1,6 @@
 """The ceiling that mask noise sets: the true frame against itself under a second mask.
 
-An avatar is judged under one mask and cannot know it at its edges; two good masks of one frame differ
+An avatar is scored under one mask and cannot know it at its edges; two good masks of one frame differ
 there. What the truth itself scores when a second mask cuts it out is what a perfect avatar could expect.
 
 - ``edge``: the same mask, one pixel smaller: what a pixel of the outline is worth. Needs nothing, and knows
@@ -14,21 +14,24 @@ there. What the truth itself scores when a second mask cuts it out is what a per
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from pipeline.detection.estimator import Estimator, estimator_scale, resize
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.detection.mediapipe import Estimator, estimator_scale, resize
 from pipeline.errors import UserError
-from pipeline.spread import spread_end_to_end
-from stages.evaluate.evidence import Evidence
+from stages.evaluate.evaluated_clip import EvaluatedClip
+from stages.evaluate.methods import CEILING, OnBackground
 from stages.evaluate.settings import EvaluateSettings
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 SHORT_SIDE, LONG_SIDE = 400, 1920  # pixels that the estimator is shown, as by ingest's defaults
 _SEGMENTATIONS = ("body_mask", "selfie_mask")
@@ -36,40 +39,56 @@ _NAMES = {"body_mask": "its pose model's segmentation", "selfie_mask": "its self
 
 
 @dataclasses.dataclass(frozen=True)
-class SecondMasks:
-    """A second opinion on some frames.
+class SecondMask:
+    """The true frames, cut out by somebody else's masks.
 
     Attributes:
+        clip: the clip.
         masks: frame -> [H, W] uint8, soft alpha.
         source: whose they are, in a few words.
+        name: ``CEILING``.
     """
 
+    clip: EvaluatedClip
     masks: Mapping[int, np.ndarray]
     source: str
+    name: str = CEILING
+
+    @property
+    def frames(self) -> Collection[int]:
+        """The frames that have a second mask."""
+        return self.masks.keys()
+
+    def render(self, frame: int) -> OnBackground:
+        """The true frame under its second mask."""
+        return partial(composite_frame, self.clip.frame(frame), self.masks[frame])
 
 
-NONE = SecondMasks({}, "")
+def no_second_mask(clip: EvaluatedClip) -> SecondMask:
+    """A ceiling that is measured on no frame."""
+    return SecondMask(clip, {}, "")
 
 
-def second_masks(context: Context, evidence: Evidence) -> SecondMasks:
+def second_mask(context: Context, clip: EvaluatedClip) -> SecondMask:
     """The second masks of the held-out frames, as the settings say.
 
     Raises:
         UserError: the folder lacks a mask, or has one of another size.
     """
     settings: EvaluateSettings = context.settings
-    held_out = evidence.split.test
+    held_out = clip.split.test
     frames = spread_end_to_end(held_out, settings.second_mask_frames or len(held_out))
     if settings.second_mask == "off" or not frames:
-        return NONE
+        return no_second_mask(clip)
     if settings.second_mask == "edge":
-        return SecondMasks({frame: edge(evidence.mask(frame)) for frame in frames}, "the same, 1 px smaller")
+        masks = {frame: edge(clip.mask(frame)) for frame in frames}
+        return SecondMask(clip, masks, "the same, 1 px smaller")
     if settings.second_mask == "estimator":
         estimator = Estimator(context.assets["mediapipe"], context.work / "mediapipe.log", still=True)
         with context.progress(len(frames), "second masks") as progress:
-            return estimated(estimator, evidence, frames, progress.advance)
+            return estimated(estimator, clip, frames, progress.advance)
     folder = Path(settings.second_mask)
-    return SecondMasks({frame: read_given(folder, evidence, frame) for frame in frames}, folder.name)
+    return SecondMask(clip, {frame: read_given(folder, clip, frame) for frame in frames}, folder.name)
 
 
 def edge(mask: np.ndarray) -> np.ndarray:
@@ -78,28 +97,28 @@ def edge(mask: np.ndarray) -> np.ndarray:
 
 
 def estimated(
-    estimator: Estimator, evidence: Evidence, frames: Sequence[int], advance: Callable[[], object]
-) -> SecondMasks:
+    estimator: Estimator, clip: EvaluatedClip, frames: Sequence[int], advance: Callable[[], object]
+) -> SecondMask:
     """MediaPipe's masks of some frames; a frame in which it sees nobody has none."""
     found: dict[str, dict[int, np.ndarray]] = {name: {} for name in _SEGMENTATIONS}
     for frame in frames:
-        image = evidence.frame(frame)
+        image = clip.frame(frame)
         height, width = image.shape[:2]
         estimate = estimator.estimate(resize(image, estimator_scale(width, height, SHORT_SIDE, LONG_SIDE)))
         for name in _SEGMENTATIONS if estimate is not None else ():
             alpha = cv2.resize(getattr(estimate, name), (width, height), interpolation=cv2.INTER_AREA)
             found[name][frame] = np.round(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
         advance()
-    agreement = {name: mean_overlap(evidence, masks) for name, masks in found.items()}
+    agreement = {name: mean_overlap(clip, masks) for name, masks in found.items()}
     best = max(_SEGMENTATIONS, key=lambda name: agreement[name])
     if not found[best]:
-        return NONE
-    return SecondMasks(found[best], f"MediaPipe's, {_NAMES[best]}, overlap {agreement[best]:.3f}")
+        return no_second_mask(clip)
+    return SecondMask(clip, found[best], f"MediaPipe's, {_NAMES[best]}, overlap {agreement[best]:.3f}")
 
 
-def mean_overlap(evidence: Evidence, masks: Mapping[int, np.ndarray]) -> float:
+def mean_overlap(clip: EvaluatedClip, masks: Mapping[int, np.ndarray]) -> float:
     """The mean intersection over union with the clip's masks, cut at one half; 0 without any."""
-    return float(np.mean([overlap(evidence.mask(frame), mask) for frame, mask in masks.items()] or [0.0]))
+    return float(np.mean([overlap(clip.mask(frame), mask) for frame, mask in masks.items()] or [0.0]))
 
 
 def overlap(first: np.ndarray, second: np.ndarray) -> float:
@@ -108,7 +127,7 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     return int(((first > 127) & (second > 127)).sum()) / union if union else 0.0
 
 
-def read_given(folder: Path, evidence: Evidence, frame: int) -> np.ndarray:
+def read_given(folder: Path, clip: EvaluatedClip, frame: int) -> np.ndarray:
     """A mask that somebody else made, [H, W] uint8.
 
     Raises:
@@ -119,7 +138,7 @@ def read_given(folder: Path, evidence: Evidence, frame: int) -> np.ndarray:
     if path is None:
         raise UserError(f"evaluate.second_mask={folder}: there is no {names[0]} or {names[-1]} in it")
     mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
-    expected = evidence.mask(frame).shape
+    expected = clip.mask(frame).shape
     if mask is None or mask.shape != expected:
         raise UserError(
             f"{path}: not a grey picture of {expected[1]} x {expected[0]} pixels, as the frame is"

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from pipeline import protocols
+from pipeline.config import evaluation_protocol as protocols
 from pipeline.config.choices import Background, LpipsNetwork, ProtocolName, Refinement, RenderMask
-from pipeline.protocols import Protocol
-from pipeline.settings import (
+from pipeline.config.evaluation_protocol import Protocol
+from pipeline.config.settings import (
     SETTINGS,
     Angle,
     Count,
@@ -37,7 +37,9 @@ class EvaluateSettings:
 
     # Sets of the three choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
     # poses refined), paper_black TalkShow's and ZJU-MoCap's (black, the truth's mask on both).
-    protocol: ProtocolName = setting("ours", "a named set of choices, see pipeline/protocols.py")
+    protocol: ProtocolName = setting(
+        "ours", "a named set of choices, see pipeline/config/evaluation_protocol.py"
+    )
     background: Literal[Auto, Background] = setting(
         "auto", "what avatar, truth and baselines are composited on; auto: as the protocol says"
     )

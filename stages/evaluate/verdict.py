@@ -1,6 +1,6 @@
-"""Whether the avatar is good and what limits it, in sentences made from the numbers.
+"""The verdict: how good the avatar is and what limits it, in sentences made from the numbers.
 
-What limits it is told by decibels that one cause or another takes, each measured on this clip:
+Each limit is told in the decibels that it takes, measured on this clip:
 
 - **masks**: the truth itself scores no more than the ceiling under a second mask;
 - **poses**: refining held-out poses on their own images gains so much;
@@ -17,8 +17,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.plan import AZIMUTH_STEP
-from stages.evaluate.scoring import AVATAR, BASELINES, CEILING, HELD_OUT, MESH, NEAREST, REFINED, TRAINING
+from pipeline.clip.plan import AZIMUTH_STEP
+from stages.evaluate.methods import AVATAR, BASELINES, CEILING, MESH, NEAREST, REFINED
+from stages.evaluate.scores import HELD_OUT, TRAINING
 
 LEVEL = 1.0  # dB within which an interval about zero means that there is no difference
 CLEAR = 1.0  # dB under which a cause is not worth naming
@@ -30,8 +31,8 @@ _OVER = {NEAREST: "copying the nearest training frame", MESH: "the textured mesh
 
 
 @dataclasses.dataclass(frozen=True)
-class Sides:
-    """What the clip shows of the person.
+class ClipCoverage:
+    """The parts of the person that the clip shows, and how well the body fits it.
 
     Attributes:
         unmodelled: the share of the body's vertices that carry no Gaussians.
@@ -44,24 +45,26 @@ class Sides:
     fit_pixels: float | None
 
 
-def verdict(summary: Mapping[str, Any], sides: Sides) -> list[str]:
+def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
     """Two or three sentences.
 
     Args:
         summary: what ``summary.json`` holds.
-        sides: what the clip shows.
+        coverage: of the person by the clip.
     """
-    return [sentence for sentence in (quality(summary), limits(summary, sides), turned(sides)) if sentence]
+    return [
+        sentence for sentence in (quality(summary), limits(summary, coverage), turned(coverage)) if sentence
+    ]
 
 
 def quality(summary: Mapping[str, Any]) -> str:
-    """How good the avatar is on frames that it never saw, against what needs no avatar."""
+    """The avatar on frames that it never saw, against what needs no avatar."""
     means = summary["means"].get(HELD_OUT, {})
     if AVATAR not in means:
         psnr = summary["means"].get(TRAINING, {}).get(AVATAR, {}).get("psnr")
         known = f": {psnr:.1f} dB on those it was trained on" if psnr is not None else ""
         return f"No frame was held out, so nothing says how good it is on new ones{known}."
-    rival, gain = _rival(summary)
+    rival, gain = _best_baseline(summary)
     score = f"{means[AVATAR]['psnr']:.1f} dB on frames it never saw"
     if rival is None or gain is None:
         return f"{score[0].upper()}{score[1:]}."
@@ -78,11 +81,11 @@ def quality(summary: Mapping[str, Any]) -> str:
     return f"{verb}: {score}{_sharpness(means, rival)}."
 
 
-def limits(summary: Mapping[str, Any], sides: Sides) -> str:
-    """What takes the most decibels."""
+def limits(summary: Mapping[str, Any], coverage: ClipCoverage) -> str:
+    """The causes that take the most decibels."""
     found = causes(summary)
     worth = sorted(((cost, text) for cost, text in found if cost >= CLEAR), reverse=True)[:NAMED]
-    fit = f" The fit is off by {sides.fit_pixels:.1f} px." if sides.fit_pixels is not None else ""
+    fit = f" The fit is off by {coverage.fit_pixels:.1f} px." if coverage.fit_pixels is not None else ""
     if worth:
         return f"What limits it most: {'; then '.join(text for _, text in worth)}.{fit}"
     ceiling = summary["means"].get(HELD_OUT, {}).get(CEILING, {}).get("psnr")
@@ -91,7 +94,7 @@ def limits(summary: Mapping[str, Any], sides: Sides) -> str:
 
 
 def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
-    """What each cause takes, dB, and says; only what was measured."""
+    """The decibels that each cause takes, and its sentence; only of what was measured."""
     means, found = summary["means"].get(HELD_OUT, {}), []
     avatar = means.get(AVATAR, {}).get("psnr")
     if avatar is None:
@@ -119,18 +122,20 @@ def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
     return found
 
 
-def turned(sides: Sides) -> str:
-    """What one sees who turns it."""
-    hollow = f"{100 * sides.unmodelled:.0f}% of the body was hardly ever in the picture and has no Gaussians"
-    behind = [azimuth for azimuth in sides.azimuths if 90 < azimuth % 360 < 270]
-    if len(sides.azimuths) and behind:
-        count = f"{len(sides.azimuths)} of {360 // AZIMUTH_STEP} directions"
+def turned(coverage: ClipCoverage) -> str:
+    """The sentence on what the avatar shows when it is turned; empty where nothing is missing."""
+    hollow = (
+        f"{100 * coverage.unmodelled:.0f}% of the body was hardly ever in the picture and has no Gaussians"
+    )
+    behind = [azimuth for azimuth in coverage.azimuths if 90 < azimuth % 360 < 270]
+    if len(coverage.azimuths) and behind:
+        count = f"{len(coverage.azimuths)} of {360 // AZIMUTH_STEP} directions"
         back = f"{count} were never filmed, the back among them: there it is a guess"
-        return f"Turned: {back}; {hollow}." if sides.unmodelled >= 0.01 else f"Turned: {back}."
-    return f"{hollow}." if sides.unmodelled >= 0.01 else ""
+        return f"Turned: {back}; {hollow}." if coverage.unmodelled >= 0.01 else f"Turned: {back}."
+    return f"{hollow}." if coverage.unmodelled >= 0.01 else ""
 
 
-def _rival(summary: Mapping[str, Any]) -> tuple[str | None, Mapping[str, float] | None]:
+def _best_baseline(summary: Mapping[str, Any]) -> tuple[str | None, Mapping[str, float] | None]:
     """The baseline that comes nearest to the avatar, and what the avatar has over it."""
     over = summary["differences"]
     known = [

@@ -1,6 +1,6 @@
 """fit: the body model registered to the clip's keypoints, wherever there are any (Section 3.1)."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.fit.settings import FitSettings
 
 STAGE = Stage(

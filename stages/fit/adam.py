@@ -20,7 +20,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.curves import Curve
+from pipeline.clip.curves import Curve
 from pipeline.numba_kernels import threads
 from stages.fit.finite import finite_loss, require_finite_gradient
 from stages.fit.objective import Objective

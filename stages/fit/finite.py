@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pipeline.guard import NotFiniteError, finite, rows_not_finite
+from pipeline.finite import NotFiniteError, finite, rows_not_finite
 from stages.fit.objective import Objective
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.windows import Window

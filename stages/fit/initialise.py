@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from pipeline.body import joint_orientations
 from pipeline.body.joints import JAW, joint_index
-from pipeline.keypoints import Keypoints
+from pipeline.clip.keypoints import Keypoints
 from stages.fit.face import FaceTarget
 from stages.fit.observations import POSE_HIPS, POSE_SHOULDERS, Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline import keypoints as coco
 from pipeline.body.landmarks import Landmarks, PointSet, join
-from pipeline.keypoints import Keypoints
+from pipeline.clip import keypoints as coco
+from pipeline.clip.keypoints import Keypoints
 from stages.fit.face_direction import POSE_TURNED, TURNED, mesh_facing, points_facing
 from stages.fit.hand_trust import trusted_flat_hands, trusted_hands
 

@@ -18,7 +18,7 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.keypoints import LEFT_HAND, RIGHT_HAND, Keypoints
+from pipeline.clip.keypoints import LEFT_HAND, RIGHT_HAND, Keypoints
 
 POSE_PAIRS = ((11, 12), (13, 14), (15, 16), (23, 24), (25, 26), (27, 28))
 BODY_PAIRS = ((5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16))

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from pipeline.body import BodyModel, Identity, Poses, draw_mesh, posed_vertices
-from pipeline.camera import Camera
-from pipeline.frames import read_frame, read_mask
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import read_frame, read_mask
 from pipeline.pictures import contact_sheet, resized, side_by_side
 
 SHEET_FRAMES = 6

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Landmarks, Poses
-from pipeline.camera import Camera
-from pipeline.curves import Curve
+from pipeline.clip.camera import Camera
+from pipeline.clip.curves import Curve
+from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
-from pipeline.keypoints import Keypoints
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import InitialPoses
 from stages.fit.adam import Recorder, optimise

@@ -23,16 +23,16 @@ from pipeline.body import (
     write_identity,
     write_poses,
 )
-from pipeline.camera import Camera
-from pipeline.frames import write_png, write_video
-from pipeline.json_files import write_json
-from pipeline.keypoints import read_keypoints
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_footage
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
-from pipeline.records import read_cameras, read_footage
-from pipeline.spread import spread_end_to_end
-from pipeline.stage import Context
-from pipeline.tables import write_table
+from pipeline.run.stage import Context
 from stages.fit.initial_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet

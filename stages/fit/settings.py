@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import SETTINGS, Count, Fraction, Weight, setting
+from pipeline.config.settings import SETTINGS, Count, Fraction, Weight, setting
 
 Steps = Annotated[int, Field(ge=0, le=1_000_000)]
 Coefficients = Annotated[int, Field(ge=1, le=1000)]

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
 class Views:
-    """A pinhole a frame; conventions as in ``pipeline.camera``.
+    """A pinhole a frame; conventions as in ``pipeline.clip.camera``.
 
     Attributes:
         rotation: [T, 3, 3], world-to-camera.

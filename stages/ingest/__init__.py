@@ -1,6 +1,6 @@
 """Footage in; frames, masks, cameras, 2D keypoints and the split out."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.ingest.settings import IngestSettings
 
 STAGE = Stage(

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.detection.estimator import Estimate, Estimator, estimator_scale, resize
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import BODY, Keypoints, empty_keypoints
+from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
 from pipeline.detection.wholebody import Landmarks, inside, to_keypoints, to_pixels
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import BODY, Keypoints, empty_keypoints
 from stages.ingest import people
 from stages.ingest.detections import check_frames, read_foreign_mask, read_whole_body
 from stages.ingest.finder import Finder
@@ -23,7 +23,7 @@ from stages.ingest.sources import Sources
 from stages.ingest.video import Clip, Picture, read_clip
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 LOOKS_A_SECOND = 5  # how often the clip is searched for people
 NATIVE_LOG = "mediapipe.log"

@@ -16,8 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.clip.keypoints import COUNT
 from pipeline.errors import UserError
-from pipeline.keypoints import COUNT
 from pipeline.untrusted import check_picture, parse_json
 from stages.ingest.video import PICTURES
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.detection.estimator import BLANK, aside, load
+from pipeline.detection.mediapipe import BLANK, aside, load
 from stages.ingest.people import Person
 
 _FINDER_GRAPH = """

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from pipeline.frames import read_frame, read_mask, write_frame, write_mask
-from pipeline.keypoints import BODY, Keypoints
+from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.clip.keypoints import BODY, Keypoints
 from stages.ingest.background import learn, log_odds, take_out
 from stages.ingest.edges import follow_edges
 from stages.ingest.steady import steady
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 TRUSTED = 0.5  # the selfie mask's share where it agrees with the pose mask
 STRANGE, AGREEING = 0.78, 0.90  # median overlap of the two: share 0, full share

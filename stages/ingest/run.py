@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.clip.keypoints import write_keypoints
+from pipeline.clip.records import Footage, write_cameras, write_footage, write_split
 from pipeline.errors import UserError
-from pipeline.keypoints import write_keypoints
 from pipeline.pose_files import RECORD, write_record
-from pipeline.records import Footage, write_cameras, write_footage, write_split
 from stages.ingest.datasets import Recording, open_recording
 from stages.ingest.mannequin.publish import run_mannequin
 from stages.ingest.preview import write_preview
@@ -20,7 +20,7 @@ from stages.ingest.shots import Ingested, because, ingest_recording
 from stages.ingest.split import split_recording
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 
 def run(context: Context) -> None:

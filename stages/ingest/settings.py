@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import (
+from pipeline.config.settings import (
     SETTINGS,
     Count,
     CountOrNone,

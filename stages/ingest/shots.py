@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
+from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
-from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses, on_frames
 from stages.ingest.cameras.apply import apply_cameras
 from stages.ingest.cameras.calibration import open_calibration
@@ -27,7 +27,7 @@ from stages.ingest.sources import open_sources
 from stages.ingest.video import Clip
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 LEAST_FRAMES = 2
 

@@ -12,7 +12,7 @@ from stages.ingest.datasets import Shot
 from stages.ingest.detections import keypoint_files, mask_files
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 MEDIAPIPE, AUTO = "mediapipe", "auto"
 

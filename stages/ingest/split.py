@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pipeline.clip.records import Split
 from pipeline.errors import UserError
-from pipeline.records import Split
 from stages.ingest.datasets import Recording
 
 

@@ -1,6 +1,6 @@
 """plan: which effects this scene calls for, each with the number that decided it."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.plan.settings import PlanSettings
 
 STAGE = Stage(

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pipeline.avatar.visibility import LEAST_CUT, evidence_threshold
 from pipeline.body import rest_joints
-from pipeline.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
-from pipeline.visibility import LEAST_CUT, evidence_threshold
+from pipeline.clip.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
 from stages.plan.measure import (
     PlanInputs,
     gaussian_pixels,

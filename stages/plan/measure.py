@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import PARTS, pose_body
-from pipeline.boxes import MARGIN
-from pipeline.camera import Camera, project, to_camera
-from pipeline.clip import FittedClip, read_fitted_clip
+from pipeline.clip.boxes import MARGIN
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.clip.plan import AZIMUTH_STEP
+from pipeline.clip.records import read_json
 from pipeline.errors import UserError
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.plan import AZIMUTH_STEP
-from pipeline.records import read_json
-from pipeline.tables import read_table
-from pipeline.visibility import body_in_frame
+from pipeline.files.tables import read_table
 
 TRUSTED = 0.4  # score from which a keypoint is believed, as in Eq. 2
 SHOWN = 0.5  # share of a part's points that a frame must show

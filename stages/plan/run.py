@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from pipeline.clip.plan import write_plan
 from pipeline.numba_kernels import threads
-from pipeline.plan import write_plan
-from pipeline.stage import Context
+from pipeline.run.stage import Context
 from stages.plan.decide import decide
 from stages.plan.measure import read_inputs
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import SETTINGS, setting
+from pipeline.config.settings import SETTINGS, setting
 
 Choice = Literal["auto", "on", "off"]
 

@@ -1,6 +1,6 @@
 """Training: frames, masks, cameras and poses to an animatable avatar (paper, Sections 3.3 to 3.6)."""
 
-from pipeline.stage import Stage
+from pipeline.run.stage import Stage
 from stages.train.settings import TrainSettings
 
 STAGE = Stage(

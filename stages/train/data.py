@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 from torch import Tensor
 
-from pipeline.body import Poses
-from pipeline.clip import FittedClip, View, ViewCache, read_fitted_clip
-from pipeline.stage import Context
+from pipeline.body import BodyModel, Poses
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
+from pipeline.clip.views import View, ViewCache
 from stages.train.generated import GeneratedFrames, joined, read_generated
 
 
@@ -53,16 +54,23 @@ class TrainingData:
         return self.crops[frame] if made is None or frame not in made.frames else made.view(frame)
 
 
-def read_training_data(context: Context) -> TrainingData:
-    """Reads and checks what ingest, fit and auxiliary published.
+def read_training_data(
+    ingest: Path, fit: Path, auxiliary: Path | None, body: BodyModel | Path, margin: int
+) -> TrainingData:
+    """The training data that ingest, fit and auxiliary published, checked.
+
+    Args:
+        ingest, fit, auxiliary: the folders of the stages; None where there are no generated frames.
+        body: the body model that the clip was fitted with, or its file.
+        margin: pixels around the person that the crops show.
 
     Raises:
         UserError: as of ``read_fitted_clip`` and ``read_generated``, or no mask shows anybody.
     """
-    clip = read_fitted_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
+    clip = read_fitted_clip(ingest, fit, body)
     return TrainingData(
         clip=clip,
-        crops=clip.cached_views(clip.person_box(context.settings.crop_margin)),
+        crops=clip.cached_views(clip.person_box(margin)),
         whole=clip.cached_views(),
-        generated=read_generated(context.inputs.get("auxiliary"), clip.poses),
+        generated=read_generated(auxiliary, clip.poses),
     )

@@ -1,10 +1,11 @@
-"""The face loss: the registered face mesh in its mean texture against the frame (paper, Section 3.6).
+"""The face in its mean texture, pasted into a frame: for L_face (paper, Section 3.6 and Equation 9).
 
 The texture is fixed: each vertex has the mean colour that the training frames show there. The mesh
 goes through the Gaussians' posed centres, so what the loss can move is geometry: offsets, pose,
 expression and translation. A face that slips over its texture costs, whatever the colour heads have
 learnt meanwhile. As in ExAvatar, the mesh is pasted into the picture: the error counts where the face
-covers it, and the mean is taken over the whole crop, so that the weight compares with L1's.
+covers it, and the mean is taken over the whole crop (``objective.py``), so that the weight compares with
+L1's.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from pipeline.avatar import Canonical
 from pipeline.body.mesh import face_normals, rasterize
-from pipeline.camera import Camera, project, to_camera
+from pipeline.clip.camera import Camera, project, to_camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,24 +29,13 @@ class Pasted:
         color: [P, 3], differentiable with respect to the mesh's vertices.
     """
 
-    rows: Tensor
-    columns: Tensor
-    color: Tensor
+    rows: Tensor  # [P]
+    columns: Tensor  # [P]
+    color: Tensor  # [P, 3]
 
-
-def face_loss(pasted: Pasted, color: Tensor, alpha: Tensor) -> Tensor:
-    """The pasted face's absolute difference from a frame, a mean over all of the frame's values.
-
-    Args:
-        pasted: the face.
-        color: [H, W, 3] in [0, 1], the frame.
-        alpha: [H, W], the person's soft mask: a face behind something else is not compared.
-
-    Returns:
-        Scalar; 0 where no face is seen.
-    """
-    truth, person = color[pasted.rows, pasted.columns], alpha[pasted.rows, pasted.columns, None]
-    return ((pasted.color - truth).abs() * person).sum() / color.numel()
+    def pixels_of(self, picture: Tensor) -> Tensor:
+        """The covered pixels of a picture, [H, W, ...] -> [P, ...]."""
+        return picture[self.rows, self.columns]
 
 
 def face_triangles(canonical: Canonical) -> Tensor:
@@ -53,7 +43,13 @@ def face_triangles(canonical: Canonical) -> Tensor:
     return canonical.is_part("face")[canonical.faces].all(1)
 
 
-def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, texture: Tensor) -> Pasted:
+def paste(
+    camera: Camera,
+    vertices: Tensor,  # [N, 3]
+    faces: Tensor,  # [F, 3] int64
+    chosen: Tensor,  # [F] bool
+    texture: Tensor,  # [N, 3]
+) -> Pasted:
     """The pixels that chosen triangles of a mesh cover in a camera's picture, with their colours.
 
     Which triangle a pixel sees is found without gradient, on the CPU wherever the mesh is; the place on it
@@ -62,10 +58,10 @@ def paste(camera: Camera, vertices: Tensor, faces: Tensor, chosen: Tensor, textu
 
     Args:
         camera: the view.
-        vertices: [N, 3], metres, world.
-        faces: [F, 3] int64, the whole mesh: what is not chosen hides what lies behind it.
-        chosen: [F] bool.
-        texture: [N, 3], each vertex's colour.
+        vertices: metres, world.
+        faces: the whole mesh: what is not chosen hides what lies behind it.
+        chosen: the triangles to paste.
+        texture: each vertex's colour.
     """
     raster = rasterize(camera, vertices, faces)
     triangle = torch.from_numpy(raster.face).to(faces)

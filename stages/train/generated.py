@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 
 from pipeline.body import Poses, read_poses
-from pipeline.clip import View, ViewCache
+from pipeline.clip.frames import read_mask
+from pipeline.clip.records import read_cameras
+from pipeline.clip.views import View, ViewCache
 from pipeline.errors import UserError
-from pipeline.frames import read_mask
-from pipeline.records import read_cameras
 
 MARK = "auxiliary.json"  # the stage publishes nothing where it is switched off
 

@@ -1,40 +1,40 @@
-"""The training loop: draw, decode, pose, render, compare, step."""
+"""The training loop: draw, decode, pose, render, compare, step. All else is done by hooks (``hooks.py``)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.curves import Curve
-from pipeline.device import moved
-from pipeline.guard import NotFiniteError, finite, require_finite
+from pipeline.body import Pose
+from pipeline.clip.views import View
+from pipeline.finite import NotFiniteError, finite, require_finite
 from pipeline.metrics import Lpips
-from pipeline.metrics.psnr import psnr
-from pipeline.splat import render
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import TrainingData
+from stages.train.hooks import Hook
 from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-from stages.train.visibility_gate import VisibilityGate
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
 
 
 class Trainer:
-    """An avatar in training, its optimisers and its curve.
+    """An avatar in training and its optimisers.
 
     Attributes:
         avatar: what is trained.
         poses: the frames' poses, refined along the way.
-        gate: which of the avatar is seen often enough to be trained; None where nothing is gated.
-        curve: what has happened so far.
+        data: what is learnt from.
+        settings: of the stage.
+        objective: what is minimised.
+        hooks: called in their order; a checkpoint holds their state under their names.
         iteration: optimiser steps done.
-        untrained: mean PSNR of some frames before the first step, dB; None while nobody has looked.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Trainer:
         data: TrainingData,
         settings: TrainSettings,
         network: Lpips | None = None,
-        gate: VisibilityGate | None = None,
+        hooks: Mapping[str, Hook] | None = None,
     ):
         """Starts at iteration 0.
 
@@ -54,23 +54,29 @@ class Trainer:
             data: the training frames.
             settings: of the stage.
             network: LPIPS, if it has a weight.
-            gate: counts what is seen, and gates the rest; None leaves all of the avatar active.
+            hooks: by name; more may be added before a checkpoint is restored.
         """
-        self.avatar, self.poses, self.settings, self.gate = avatar, poses, settings, gate
-        self.data, self.objective = data, Objective(avatar, poses, data, settings, network)
-        self.objective.on_frame = None if gate is None else gate.count
-        self.curve, self.iteration = Curve(), 0
-        self.untrained: float | None = None
+        self.avatar, self.poses, self.settings, self.data = avatar, poses, settings, data
+        self.hooks: dict[str, Hook] = dict(hooks or {})
+        self.objective = Objective(avatar, poses, data, settings, network, self._on_frame)
+        self.iteration = 0
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
-        self._parameters = [
-            (f"{prefix}.{name}", parameter)
-            for prefix, module in self._modules().items()
-            for name, parameter in module.named_parameters()
-        ]
         self._update_phase()
 
+    def run(self) -> None:
+        """Takes all steps that are left, hooks included.
+
+        Raises:
+            NotFiniteError: as of ``step``, or a parameter is not finite in the end.
+        """
+        for hook in self.hooks.values():
+            hook.on_start(self)
+        while self.iteration < self.settings.iterations:
+            self.step()
+        self.require_finite()
+
     def step(self) -> dict[str, float]:
-        """One optimiser step; returns the weighted loss terms.
+        """The weighted loss terms of one optimiser step that it takes.
 
         Raises:
             NotFiniteError: a term or a gradient is not finite; nothing has been changed then.
@@ -92,12 +98,9 @@ class Trainer:
         self._avatar_optimizer.step()
         if self._poses_move():
             self._pose_optimizer.step()
-        self.curve.count(values)
         self.iteration += 1
-        if self.gate is not None and self.gate.due(self.iteration):
-            self.gate.update()
-        if self.settings.skinning == "nearest" and self.iteration % self.settings.skin_every == 0:
-            self.avatar.reskin()
+        for hook in self.hooks.values():
+            hook.on_step(self, values)
         return values
 
     @property
@@ -105,22 +108,6 @@ class Trainer:
         """The level of subdivision that is trained now."""
         fine = schedule.reached(self.settings, self.settings.subdivide_from, self.iteration)
         return self.settings.subdivisions if fine else 0
-
-    def held_out(self, frames: tuple[int, ...]) -> float:
-        """Mean PSNR of the person on black in uncropped frames, at their fitted poses, dB.
-
-        Of the level of subdivision that is trained now: the finer one is not ready before its time.
-        """
-        values = []
-        with torch.no_grad():
-            decoded = self.avatar.decode(self.level)
-            for frame in frames:
-                view, pose = moved(self.data.whole[frame], self.avatar.device), self.poses.fitted(frame)
-                time = self.data.clip.seconds.get(frame)
-                posed = self.avatar.pose(decoded, pose, time=time)
-                color = render(posed.gaussians, view.camera).color
-                values.append(psnr(color.clamp(0, 1), view.composite(color.new_zeros(3))))
-        return sum(values) / len(values)
 
     def checkpoint(self, key: str) -> Checkpoint:
         """A checkpoint with all of the state.
@@ -130,14 +117,16 @@ class Trainer:
         """
         self.require_finite()
         tensors = gather(self._modules(), (self._avatar_optimizer, self._pose_optimizer))
-        return Checkpoint(self.iteration, key, tensors, {**self.curve.state(), "untrained": self.untrained})
+        extra = {name: hook.json_state() for name, hook in self.hooks.items()}
+        return Checkpoint(self.iteration, key, tensors, extra)
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Restores the state of a checkpoint."""
+        """Restores the state of a checkpoint, the hooks' included."""
         restore(checkpoint.tensors, self._modules(), (self._avatar_optimizer, self._pose_optimizer))
         self.avatar.apply_skin()
-        self.curve, self.iteration = Curve.restored(checkpoint.extra), checkpoint.iteration
-        self.untrained = checkpoint.extra.get("untrained")
+        self.iteration = checkpoint.iteration
+        for name, hook in self.hooks.items():
+            hook.restore(checkpoint.extra.get(name, {}))
         self._update_phase()
 
     def require_finite(self) -> None:
@@ -155,7 +144,12 @@ class Trainer:
 
     def _require_finite_gradients(self) -> None:
         """Refuses gradients that are not finite: a finite loss may have them, and Adam would spread them."""
-        found = [(name, weight.grad) for name, weight in self._parameters if weight.grad is not None]
+        found = [
+            (f"{prefix}.{name}", weight.grad)
+            for prefix, module in self._modules().items()
+            for name, weight in module.named_parameters()
+            if weight.grad is not None
+        ]
         if not finite(gradient for _, gradient in found):
             named = {f"the gradient of {name}": gradient for name, gradient in found}
             require_finite(named, "training", self._where, self._remedy)
@@ -176,17 +170,23 @@ class Trainer:
         )
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        modules: dict[str, torch.nn.Module] = {
+        """Everything with state, by the prefix that its tensors have in messages and checkpoints."""
+        own = {
             "avatar": self.avatar, "poses": self.poses,
             "visibility_cache": self.objective.visibility_cache,
         }  # fmt: skip
-        return modules if self.gate is None else {**modules, "gate": self.gate}
+        return own | {name: hook for name, hook in self.hooks.items() if isinstance(hook, torch.nn.Module)}
+
+    def _on_frame(self, pose: Pose, view: View) -> None:
+        for hook in self.hooks.values():
+            hook.on_frame(pose, view)
 
     def _poses_move(self) -> bool:
         settings = self.settings
         return settings.refine_poses and schedule.reached(settings, settings.refine_from, self.iteration)
 
     def _update_phase(self) -> None:
+        """Switches on what the schedule says, and sets the learning rates."""
         settings = self.settings
         self.avatar.pose_heads_active = schedule.begun(settings, settings.pose_heads_from, self.iteration)
         self.avatar.residuals_active = schedule.begun(settings, settings.residual_from, self.iteration)
@@ -214,18 +214,3 @@ def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.A
     described = [{"params": parameters, "lr": rate, "base_rate": rate} for parameters, rate in groups]
     # The fused kernel is ten times faster on a CPU than the loop over tensors; CUDA has one, too.
     return torch.optim.Adam(described, betas=BETAS, eps=EPSILON, fused=True)
-
-
-def describe(values: dict[str, float]) -> str:
-    """The note beside the progress bar."""
-    return f"loss {sum(values.values()):.4f}"
-
-
-def point_values(trainer: Trainer, psnr_db: float | None) -> dict[str, float]:
-    """The values of a point of the curve besides the loss terms."""
-    values = {
-        "gaussians": float(len(trainer.avatar.surface(trainer.level).canonical)),
-        "learning_rate": trainer.settings.learning_rate
-        * schedule.rate_factor(trainer.settings, trainer.iteration),
-    }
-    return values if psnr_db is None else {**values, "psnr": psnr_db}

@@ -10,7 +10,7 @@ from pipeline.device import moved
 
 
 class PoseRefinement(nn.Module):
-    """A change of pose for every frame that may move.
+    """The refined poses: a change of pose for every frame that may move.
 
     Each frame has parameters of its own: in one tensor for all frames, Adam's momentum would go on
     moving frames that were not drawn.
@@ -45,10 +45,9 @@ class PoseRefinement(nn.Module):
         )
 
     def change(self, frame: int) -> Tensor:
-        """Mean squared change of a training frame's pose; radians, expression units, decimetres."""
+        """The change of a training frame's pose, [D]: radians, expression units, decimetres."""
         name = str(frame)
-        parts = [self.rotation[name].flatten(), self.expression[name], 10 * self.transl[name]]
-        return torch.cat(parts).square().mean()
+        return torch.cat([self.rotation[name].flatten(), self.expression[name], 10 * self.transl[name]])
 
     def refined(self, frames: tuple[int, ...] | None = None) -> Poses:
         """Poses as they now are, of all frames or of some; on the CPU."""

@@ -1,4 +1,4 @@
-"""Everything that depends on the iteration alone: rates, what is active, and random draws.
+"""Everything that depends on the iteration alone: rates, phases, costs and random draws.
 
 Draws have no state. Each is made from (seed, purpose, position), so that a run that was killed and
 resumed draws what an uninterrupted one would have drawn.
@@ -6,8 +6,10 @@ resumed draws what an uninterrupted one would have drawn.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -16,6 +18,32 @@ from torch import Tensor
 from stages.train.settings import TrainSettings
 
 FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP, SOURCE = 1, 2, 3, 4, 5, 6  # purposes
+
+# Costs in Gaussians' static heads, read off runs of `smile`, in which the second half, subdivided and with
+# all heads, takes four times as long as the first steps. They matter only until a phase has been measured.
+PICTURE_COST = 6000.0  # rendering and comparing
+POSE_HEADS_COST, RESIDUALS_COST = 1.0, 0.1  # of what the static heads take
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The random values of one draw of a frame. Equal positions in a run draw equally.
+
+    Attributes:
+        position: which draw of the run this is.
+        frame: its number.
+        background: [3], the colour behind the person.
+        noise: [54 * 6], added to what the heads are told of the pose.
+        time: seconds that the residual heads are told; None where they are told none.
+        place: in [0, 1), where on the person LPIPS looks.
+    """
+
+    position: int
+    frame: int
+    background: Tensor  # [3]
+    noise: Tensor  # [54 * 6]
+    time: float | None
+    place: float
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
@@ -34,6 +62,58 @@ def reached(settings: TrainSettings, fraction: float, iteration: int) -> bool:
 def begun(settings: TrainSettings, fraction: float, iteration: int) -> bool:
     """True where something that starts at ``fraction`` of the run takes part; 1 stands for never."""
     return fraction < 1 and reached(settings, fraction, iteration)
+
+
+def first_iteration(settings: TrainSettings, fraction: float) -> int | None:
+    """The first iteration at which ``begun`` is true; None for never."""
+    return None if fraction == 1 else math.ceil(fraction * settings.iterations)
+
+
+def step_costs(settings: TrainSettings, gaussians: Sequence[int]) -> list[float]:
+    """The relative cost of every iteration of a run, for the time left that is shown.
+
+    Args:
+        settings: of the stage.
+        gaussians: their number at each level of subdivision.
+    """
+
+    def cost(iteration: int) -> float:
+        fine = reached(settings, settings.subdivide_from, iteration)
+        heads = 1.0
+        heads += POSE_HEADS_COST * begun(settings, settings.pose_heads_from, iteration)
+        heads += RESIDUALS_COST * begun(settings, settings.residual_from, iteration)
+        return PICTURE_COST + heads * gaussians[-1 if fine else 0]
+
+    return [cost(iteration) for iteration in range(settings.iterations)]
+
+
+def make_draw(
+    settings: TrainSettings,
+    sources: tuple[tuple[int, ...], tuple[int, ...]],
+    seconds: Mapping[int, float],
+    noise_size: int,
+    position: int,
+) -> Draw:
+    """Everything random about the ``position``-th drawn frame of a run.
+
+    Args:
+        settings: of the stage.
+        sources: numbers of captured and of generated frames.
+        seconds: frame number -> when it was filmed, where that is known.
+        noise_size: of the noise.
+        position: which draw.
+    """
+    seed = settings.seed
+    frame = drawn_of_two(seed, *sources, settings.generated_every, position)
+    timeless = drawn_share(seed, TIME, position) < settings.time_dropout
+    return Draw(
+        position=position,
+        frame=frame,
+        background=drawn_background(seed, position),
+        noise=settings.pose_noise * drawn_noise(seed, position, noise_size),
+        time=None if timeless else seconds.get(frame),
+        place=drawn_share(seed, CROP, position),
+    )
 
 
 def drawn_frame(seed: int, frames: tuple[int, ...], position: int) -> int:

@@ -1,14 +1,15 @@
-"""What can be set about training. The defaults are the ``quick`` preset's values."""
+"""The settings of the train stage; the defaults are the ``quick`` preset's values."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from pipeline.config.choices import Device, LpipsNetwork, ResidualPart, ResidualPlace
-from pipeline.settings import (
+from pipeline.config.settings import (
     SETTINGS,
     Count,
     CountOrNone,
@@ -19,6 +20,9 @@ from pipeline.settings import (
     Weight,
     setting,
 )  # fmt: skip
+
+if TYPE_CHECKING:  # settings are read by what must start quickly
+    from pipeline.clip.plan import Plan
 
 Batch = Annotated[int, Field(ge=1, le=10_000)]
 Threads = Annotated[int, Field(ge=0, le=1024)]
@@ -33,6 +37,9 @@ Frequencies = Annotated[int, Field(ge=0, le=32)]
 Threshold = Annotated[float, Field(gt=0, le=1)]
 Rings = Annotated[int, Field(ge=0, le=1000)]
 Pixels = Annotated[int, Field(ge=0, le=8192)]
+
+PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
+MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 
 
 @dataclass(frozen=True, config=SETTINGS)
@@ -175,3 +182,27 @@ class TrainSettings:
                 f"not be {self.residual_width}"
             )
         return self
+
+
+def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
+    """The settings with what the plan calls needless switched off; the plan switches nothing on."""
+    needless = {part for part in PLANNED_RESIDUALS if not plan.on(f"{part}_residual")}
+    parts = tuple(part for part in settings.residual_parts if part not in needless)
+    return dataclasses.replace(
+        settings,
+        residual_parts=parts,
+        residual_from=settings.residual_from if parts else 1.0,
+        subdivisions=min(settings.subdivisions, subdivision_levels(plan)),
+        pose_heads_from=settings.pose_heads_from if plan.on("pose_heads") else 1.0,
+        refine_poses=settings.refine_poses and plan.on("pose_refinement"),
+        face=settings.face if plan.on("face_loss") else 0.0,
+        gate=settings.gate and plan.on("visibility_gate"),
+    )
+
+
+def subdivision_levels(plan: Plan) -> int:
+    """The most levels of subdivision that the plan allows: all where a setting switched it on."""
+    decision = plan["subdivision"]
+    if not decision.on:
+        return 0
+    return MOST_LEVELS if decision.forced or not decision.values else int(decision.values[0])

@@ -7,9 +7,10 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from pipeline.compiling import CompileTimer
-from pipeline.json_files import write_json
+from pipeline.files.json_files import write_json
+from pipeline.run.compile_timer import CompileTimer
 
 NAME = "timer.json"
 
@@ -25,18 +26,25 @@ class TrainingTimer:
         earlier: of the processes that were killed before this one, up to their last checkpoint.
     """
 
-    def __init__(self, work: Path, iteration: int, compiled: CompileTimer):
-        """Starts; goes on from the marks of a killed run if training goes on from its checkpoint.
+    def __init__(self, work: Path, compiled: CompileTimer):
+        """Starts at iteration 0.
 
         Args:
             work: the folder with the checkpoint.
-            iteration: steps done at the start.
             compiled: what this process has compiled.
         """
         self._compiled = compiled
         self._file = work / NAME
         self.marks: list[Mark] = []
         self.earlier: Mark = (0, 0.0, 0.0)
+        self._wall, self._cpu = self._spent()
+
+    def start(self, iteration: int) -> None:
+        """Starts anew, from the marks of a killed run if training goes on from its checkpoint.
+
+        Args:
+            iteration: steps done.
+        """
         if iteration:
             self._read(iteration)
         self._wall, self._cpu = self._spent()
@@ -70,6 +78,24 @@ class TrainingTimer:
         """Stores the marks beside a checkpoint that has just been written."""
         state = {"earlier": self.now(iteration), "marks": self.marks}
         write_json(self._file, state)
+
+    def summary(self, first: int, last: int) -> dict[str, Any]:
+        """The seconds of all iterations and of each of this process's, for run.json.
+
+        ``curve_seconds`` has iteration, wall-clock and processor seconds of each point of the curve.
+
+        Args:
+            first: the iteration that this process began with.
+            last: iterations done.
+        """
+        _, wall, _ = self.now(last)
+        return {
+            "train_seconds": wall,
+            "milliseconds_an_iteration": 1e3 * (wall - self.earlier[1]) / max(1, last - first),
+            "curve_seconds": self.marks,
+            "earlier_seconds": self.earlier[1],
+            "earlier_cpu_seconds": self.earlier[2],
+        }
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:

@@ -5,7 +5,7 @@ That is measured for gated vertices as for all others, by posing the bare body, 
 
 The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
-the captured frames' scores (:mod:`pipeline.visibility`) and what lies below it is gated: it leaves
+the captured frames' scores (:mod:`pipeline.avatar.visibility`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
 that a region that comes into view later returns.
 
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -29,14 +30,18 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
 from pipeline.body import Pose
-from pipeline.clip import View, ViewCache
+from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
-from pipeline.json_files import write_json
-from pipeline.tables import write_table
-from pipeline.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
+from stages.train.hooks import Hook
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from stages.train.loop import Trainer
 
 SCHEMA = pa.schema(
     [
@@ -51,7 +56,7 @@ DEFINITION = "in_frame"  # what counts as seen, for gate.json
 CAPTURED, GENERATED = 0, 1
 
 
-class VisibilityGate(nn.Module):
+class VisibilityGate(nn.Module, Hook):
     """The visibility scores of one run, and the threshold found in them.
 
     Attributes:
@@ -89,7 +94,7 @@ class VisibilityGate(nn.Module):
         return self._avatar[0]
 
     @torch.no_grad()
-    def count(self, pose: Pose, view: View) -> None:
+    def on_frame(self, pose: Pose, view: View) -> None:
         """Counts one drawn frame and the vertices in its picture.
 
         Args:
@@ -99,6 +104,11 @@ class VisibilityGate(nn.Module):
         source = GENERATED if view.generated else CAPTURED
         self.hits[source] += body_in_frame(self.avatar.surfaces[0], pose, view.camera)
         self.drawn[source] += 1
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Finds the threshold anew where it is time."""
+        if self.due(trainer.iteration):
+            self.update()
 
     def scores(self) -> Tensor:
         """v_i of the avatar's body vertices, captured and generated: [2, K] in [0, 1]."""

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 from tests.faults.campaign import (
     A_STAGE,
     CORRUPT,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-from pipeline.verify import look_at, remedy
+from pipeline.store.verify import look_at, remedy
 from tests.faults.project import Project
 
 

@@ -6,10 +6,10 @@ import json
 import os
 from pathlib import Path
 
-from pipeline import digest
-from pipeline.artifact import LATEST, LOCK, MANIFEST, RUN, SCRATCH, in_use
-from pipeline.seal import SEAL
-from pipeline.verify import damages
+from pipeline.store import digest
+from pipeline.store.artifact import LATEST, LOCK, MANIFEST, RUN, SCRATCH, in_use
+from pipeline.store.record_digests import SEAL
+from pipeline.store.verify import damages
 from tests.faults.project import Project
 
 # What differs between two equal runs: seconds, in the run's own record and in what shows it.

@@ -7,9 +7,9 @@ import os
 import sys
 from pathlib import Path
 
-from pipeline.artifact import Store
-from pipeline.stage import load_stages, usual
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
+from pipeline.run.stage import load_stages, usual
+from pipeline.store.artifact import Store
 
 SUBJECT = "tiny"
 TINY = """title = "A mannequin's head, as small as it gets"

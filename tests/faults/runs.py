@@ -14,9 +14,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.artifact import LATEST, MANIFEST, RUN, SCRATCH
-from pipeline.seal import SEAL
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
+from pipeline.store.artifact import LATEST, MANIFEST, RUN, SCRATCH
+from pipeline.store.record_digests import SEAL
 from tests.faults.project import Project
 
 TARGETS = ("group", "stage", "doit")

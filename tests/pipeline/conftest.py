@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from pipeline.config.request import parse_request
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 
 class ToyProject:

@@ -6,9 +6,10 @@ import zipfile
 
 import pytest
 
-from pipeline import assets, digest
+from pipeline.config import assets
+from pipeline.config.workspace import REPOSITORY, open_workspace
 from pipeline.errors import UserError
-from pipeline.workspace import REPOSITORY, open_workspace
+from pipeline.store import digest
 
 
 @pytest.fixture

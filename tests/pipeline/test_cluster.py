@@ -6,10 +6,10 @@ import time
 
 import pytest
 
-from pipeline.batch import Resources, fitting, import_ray, resources_of, way, without_dashboard
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.stage import Stage, load_stages
-from pipeline.workspace import REPOSITORY
+from pipeline.run.ray_batch import Resources, fitting, import_ray, resources_of, way, without_dashboard
+from pipeline.run.stage import Stage, load_stages
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
 NAMES = ("one", "two", "three", "four", "five", "six")

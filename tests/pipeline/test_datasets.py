@@ -4,13 +4,13 @@ import json
 
 import pytest
 
-from pipeline.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
+from pipeline.config.datasets import Dataset, Row, known_datasets, load_dataset, subjects_of
+from pipeline.config.evaluation_protocol import Protocol
+from pipeline.config.settings import Layer
+from pipeline.config.subjects import load_subject
+from pipeline.config.workspace import open_workspace
 from pipeline.errors import UserError
-from pipeline.protocols import Protocol
-from pipeline.settings import Layer
 from pipeline.studies.compare import comparison, wanted
-from pipeline.subjects import load_subject
-from pipeline.workspace import open_workspace
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from pipeline import digest
+from pipeline.store import digest
 
 SEED = 11
 OLD = 1_600_000_000

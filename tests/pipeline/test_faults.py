@@ -11,11 +11,11 @@ import time
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.artifact import LATEST, Store
-from pipeline.batch import run_subject
-from pipeline.job import open_job, run_stage
-from pipeline.verify import damages
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
+from pipeline.run.job import open_job, run_stage
+from pipeline.run.ray_batch import run_subject
+from pipeline.store.artifact import LATEST, Store
+from pipeline.store.verify import damages
 from tests.faults.runs import alive
 
 STAGES = ("gather", "bend", "paint")

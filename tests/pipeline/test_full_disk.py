@@ -11,12 +11,12 @@ import pyarrow as pa
 import pytest
 from safetensors.numpy import save_file
 
-from pipeline.artifact import Store
-from pipeline.explain import explain, is_disk_full, size
-from pipeline.frames import write_png
-from pipeline.job import open_job, run_stage
-from pipeline.tables import write_table
-from pipeline.verify import damages
+from pipeline.clip.frames import write_png
+from pipeline.error_messages import explain, is_disk_full, size
+from pipeline.files.tables import write_table
+from pipeline.run.job import open_job, run_stage
+from pipeline.store.artifact import Store
+from pipeline.store.verify import damages
 
 STAGES = ("gather", "bend", "paint")
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096

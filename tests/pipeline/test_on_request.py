@@ -3,10 +3,10 @@
 import pytest
 
 from pipeline.config.request import parse_request
+from pipeline.config.settings import as_dict
 from pipeline.errors import UserError
-from pipeline.job import key_of, open_job
-from pipeline.settings import as_dict
-from pipeline.stage import load_stages, usual
+from pipeline.run.job import key_of, open_job
+from pipeline.run.stage import load_stages, usual
 
 
 def song(toy, subject):

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from pipeline.artifact import Store, wrong_digests, wrong_sizes
 from pipeline.errors import UserError
-from pipeline.verify import verify
+from pipeline.store.artifact import Store, wrong_digests, wrong_sizes
+from pipeline.store.verify import verify
 
 
 def publish(store, key="k1", text="one", stage="fit"):

@@ -7,10 +7,10 @@ import sys
 import pytest
 
 from pipeline.config.request import parse_request
-from pipeline.job import open_job
-from pipeline.stage import load_stages
-from pipeline.subjects import known_subjects
-from pipeline.workspace import REPOSITORY
+from pipeline.config.subjects import known_subjects
+from pipeline.config.workspace import REPOSITORY
+from pipeline.run.job import open_job
+from pipeline.run.stage import load_stages
 
 
 def imports(path):

@@ -8,16 +8,16 @@ import time
 
 import pytest
 
-from pipeline.artifact import Store
 from pipeline.config.request import parse_request
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.job import open_job
+from pipeline.run.job import open_job
+from pipeline.store.artifact import Store
 from pipeline.studies.ablation import FULL, variants_of
 from pipeline.studies.measure import MeasurementCache
 from pipeline.studies.search import seconds_of
 from pipeline.studies.sweep import CHANCE, sweep_levels
 from pipeline.studies.variants import LEAN, Base, Variant, base_of
-from pipeline.workspace import REPOSITORY
 
 VARIANTS = (
     Variant("base"),

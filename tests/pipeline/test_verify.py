@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from pipeline.artifact import LATEST, Store
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.verify import damages, verify
-from pipeline.workspace import REPOSITORY
+from pipeline.store.artifact import LATEST, Store
+from pipeline.store.verify import damages, verify
 
 SEED = 7
 

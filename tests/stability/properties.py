@@ -16,14 +16,20 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from pipeline.avatar.visibility import (
+    LARGEST_LOSS,
+    evidence_threshold,
+    histogram,
+    otsu_threshold,
+    share_below,
+)
 from pipeline.body import Poses, linear_blend_skinning, uniform_laplacian, vertex_normals
-from pipeline.camera import facing_camera, project
-from pipeline.composite import composite_frame
-from pipeline.guard import finite
+from pipeline.clip.camera import facing_camera, project
+from pipeline.clip.composite import composite_frame
+from pipeline.finite import finite
 from pipeline.metrics import interior, psnr, ssim, ssim_loss
 from pipeline.metrics.ssim import plain_ssim_loss
 from pipeline.splat import Gaussians, render
-from pipeline.visibility import LARGEST_LOSS, evidence_threshold, histogram, otsu_threshold, share_below
 from stages.fit import terms
 from stages.fit.initialise import continuous
 from stages.fit.observations import drop_guesses, visible
@@ -34,7 +40,6 @@ from stages.fit.windows import bumps, windows
 from stages.ingest.masks import fill_holes, fuse, main_component
 from stages.ingest.split import split_frames
 from stages.train import losses, schedule
-from stages.train.perceptual import crop
 
 PROPERTIES: dict[str, tuple[st.SearchStrategy, Callable[[Any], None]]] = {}
 
@@ -240,13 +245,13 @@ def image_losses_are_finite_with_finite_slopes(pair):
     leaf = image.requires_grad_()
     fused, plain = ssim_loss(leaf, truth), plain_ssim_loss(leaf, truth)
     assert abs(float((fused - plain).detach())) < 2e-3
-    (losses.l1(leaf, truth) + fused + plain).backward()
+    (losses.l1(leaf, truth).mean() + fused + plain).backward()
     assert leaf.grad.isfinite().all()
 
 
 @property_of(arrays(9, 7, low=0.0, high=1.0), st.integers(0, 40), st.floats(0, 1, exclude_max=True))
 def a_crop_lies_in_the_picture(alpha, side, share):
-    rows, columns = crop(tensor(alpha), side, share)
+    rows, columns = losses.person_crop(tensor(alpha), side, share)
     assert 0 <= rows.start < rows.stop <= 9 and 0 <= columns.start < columns.stop <= 7
 
 
@@ -260,8 +265,8 @@ def regularisers_are_not_negative_and_have_finite_slopes(offset, log_scale):
         losses.outward_offset(leaf, normals),
         losses.color_variance(leaf),
     ]
-    assert all(value.isfinite() and value >= 0 for value in values)
-    sum(values).backward()
+    assert all(value.isfinite().all() and (value >= 0).all() for value in values)
+    sum(value.mean() for value in values).backward()
     assert leaf.grad.isfinite().all() and scale.grad.isfinite().all()
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
+from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.clip.records import Split, read_cameras, write_split
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_frame, write_mask
-from pipeline.records import Split, read_cameras, write_split
 from pipeline.texture import robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary.texture.complete import membrane, neighbours

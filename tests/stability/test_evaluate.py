@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints, read_keypoints, write_keypoints
+from pipeline.clip.plan import EFFECTS, read_plan
+from pipeline.clip.records import Split, write_split
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import empty_keypoints, read_keypoints, write_keypoints
-from pipeline.plan import EFFECTS, read_plan
-from pipeline.records import Split, write_split
+from pipeline.files.tables import write_table
+from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.splat import Gaussians, render
-from pipeline.tables import write_table
-from pipeline.turntable import orbit, visible_extent
 from stages.plan import measure
 from stages.plan.run import run as run_plan
 from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, stand_in
@@ -42,22 +42,22 @@ def assert_published(output):
     walk(summary_of(output))
 
 
-def invisible(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def invisible(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, opacities=torch.zeros(40))
 
 
-def nobody(rotation, expression, transl, time):
-    return stand_in(rotation, expression, transl, time).select(torch.zeros(0, dtype=torch.long))
+def nobody(pose, time):
+    return stand_in(pose, time).select(torch.zeros(0, dtype=torch.long))
 
 
-def broken(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def broken(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, means=seen.means * math.nan)
 
 
-def enormous(rotation, expression, transl, time):
-    seen = stand_in(rotation, expression, transl, time)
+def enormous(pose, time):
+    seen = stand_in(pose, time)
     return dataclasses.replace(seen, scales=seen.scales * 1e12, means=seen.means * 1e9)
 
 

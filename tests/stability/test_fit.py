@@ -9,10 +9,10 @@ import roma
 import torch
 
 from pipeline.body import joint_index, pose_body
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.keypoints import empty_keypoints
 from pipeline.errors import UserError
-from pipeline.guard import NotFiniteError
-from pipeline.keypoints import empty_keypoints
+from pipeline.finite import NotFiniteError
 from stages.fit.adam import optimise
 from stages.fit.objective import Objective
 from stages.fit.outlier_frames import BODY_PAIRS, mask_outlier_frames

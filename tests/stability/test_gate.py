@@ -5,10 +5,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.body import load_body, mean_identity
-from pipeline.errors import UserError
-from pipeline.records import read_json
-from pipeline.visibility import (
+from pipeline.avatar.visibility import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
@@ -18,11 +15,13 @@ from pipeline.visibility import (
     otsu_threshold,
     share_below,
 )
+from pipeline.body import load_body, mean_identity
+from pipeline.clip.records import read_json
+from pipeline.errors import UserError
 from stages.train import run as stage
 from stages.train.visibility_gate import VisibilityGate
 from tests.stability.test_skinning import SMALL
-from tests.stages.test_train import trainer_for
-from tests.stages.train_subject import BODY_FILE, TINY, context_for, write_subject
+from tests.stages.train_subject import BODY_FILE, TINY, context_for, trainer_for, write_subject
 
 RNG = np.random.default_rng(0)
 SHAPES = {
@@ -102,15 +101,15 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
     settings = {"gate_threshold": 1.0, "gate_from": 0.25, "gate_every": 2, "iterations": 8}
     trainer = trainer_for(context_for(subject, tmp_path / "out", **settings))
     before = int(trainer.avatar.active.sum())
-    trainer.gate.drawn[:] = 10
-    trainer.gate.hits[:] = 9
-    found = trainer.gate.update()
+    trainer.hooks["gate"].drawn[:] = 10
+    trainer.hooks["gate"].hits[:] = 9
+    found = trainer.hooks["gate"].update()
     assert not found.closed and "all of the body" in found.why
     assert int(trainer.avatar.active.sum()) == before
     values = trainer.step()
     assert np.isfinite(list(values.values())).all()
     (tmp_path / "written").mkdir()
-    trainer.gate.write(tmp_path / "written")
+    trainer.hooks["gate"].write(tmp_path / "written")
     assert read_json(tmp_path / "written" / "gate.json", "")["tau"] == 0
 
 

@@ -9,15 +9,15 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from pipeline import guard
-from pipeline.artifact import Store
+from pipeline import finite as guard
 from pipeline.body import Poses, write_poses
+from pipeline.error_messages import explain
 from pipeline.errors import UserError
-from pipeline.explain import explain
-from pipeline.guard import NotFiniteError, finite, require_finite, require_finite_files
-from pipeline.json_files import write_json
-from pipeline.tables import write_table
-from stages.evaluate.scoring import Scorer
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
+from pipeline.finite import NotFiniteError, finite, require_finite, require_finite_files
+from pipeline.store.artifact import Store
+from stages.evaluate.frame_metrics import Scorer
 
 BAD = [math.nan, math.inf, -math.inf]
 KEY = "0123456789abcdef"

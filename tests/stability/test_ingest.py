@@ -7,10 +7,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_split
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import read_keypoints
-from pipeline.records import read_cameras, read_split
 from stages.ingest.cameras.lens import distortion, straightened, undistort
 from stages.ingest.masks import fill_holes, follow_edges, fuse, main_component, overlap, selfie_share
 from stages.ingest.run import run

@@ -7,10 +7,9 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.metrics import PSNR_CAP, Lpips, interior, psnr, ssim, ssim_loss
-from pipeline.metrics.identity import identity_cosine
+from pipeline.metrics.face_identity import identity_cosine
 from pipeline.metrics.ssim import plain_ssim_loss
 from stages.train import losses
-from stages.train.perceptual import crop
 
 GENERATOR = torch.Generator().manual_seed(0)
 NOISE = torch.rand(24, 20, 3, generator=GENERATOR)
@@ -35,7 +34,7 @@ def test_every_pair_has_finite_scores_and_slopes(pair):
     assert -1.0001 <= ssim(image, truth) <= 1 + 1e-9
     for loss in (losses.l1, ssim_loss, plain_ssim_loss):
         leaf = image.clone().requires_grad_()
-        value = loss(leaf, truth)
+        value = loss(leaf, truth).mean()
         value.backward()
         assert value.isfinite() and leaf.grad.isfinite().all(), loss.__name__
 
@@ -78,7 +77,7 @@ def test_an_image_that_is_not_finite_shows_in_the_losses(value):
     image = NOISE.clone()
     image[5, 7, 1] = value
     for loss in (losses.l1, ssim_loss, plain_ssim_loss):
-        assert not loss(image, NOISE).isfinite(), loss.__name__
+        assert not loss(image, NOISE).mean().isfinite(), loss.__name__
 
 
 def test_nobody_inside_the_mask():
@@ -90,7 +89,7 @@ def test_nobody_inside_the_mask():
 def test_a_crop_of_an_empty_mask_and_of_a_small_view_lies_inside():
     for height, width in ((24, 20), (5, 200), (1, 1)):
         for share in (0.0, 0.999999):
-            rows, columns = crop(torch.zeros(height, width), 16, share)
+            rows, columns = losses.person_crop(torch.zeros(height, width), 16, share)
             assert 0 <= rows.start < rows.stop <= height and 0 <= columns.start < columns.stop <= width
 
 

@@ -10,7 +10,7 @@ import types
 import pytest
 import torch
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.splat import Gaussians, render
 from pipeline.splat.gsplat_backend import render_gsplat
 from tests.unit.splat_scene import NAMES, draw, images, leaves, scene

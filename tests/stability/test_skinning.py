@@ -8,7 +8,7 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.canonical import build_canonical
-from pipeline.avatar.posing import plain_normals, plain_place
+from pipeline.avatar.skinning_tables import plain_normals, plain_place
 from pipeline.body import (
     Identity,
     Pose,
@@ -22,7 +22,7 @@ from pipeline.body import (
     uniform_laplacian,
     vertex_normals,
 )
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.splat import render
 from tests.stages.train_subject import BODY_FILE
@@ -192,7 +192,7 @@ def test_an_avatar_of_a_few_points_decodes_poses_and_learns(body, kept):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_group_norm_of_equal_channels_is_finite(body, dtype):
     """One point whose channels are all equal: a variance of zero."""
-    from pipeline.avatar.heads import Head
+    from pipeline.avatar.head import Head
 
     torch.manual_seed(0)
     head = Head(4, 3, width=16, groups=4)

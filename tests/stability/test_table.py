@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 from tests.stability.properties import PROPERTIES
 
 TABLE = REPOSITORY / "docs" / "stability.md"

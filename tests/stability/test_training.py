@@ -9,15 +9,23 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
+from pipeline.clip.frames import frame_path, write_frame, write_mask
 from pipeline.errors import UserError
-from pipeline.frames import frame_path, write_frame, write_mask
-from pipeline.guard import NotFiniteError
-from stages.train import losses, objective, schedule
+from pipeline.finite import NotFiniteError
 from stages.train import run as stage
+from stages.train import schedule
 from stages.train.checkpoint import NAME, read_checkpoint
-from stages.train.divergence import require_progress
-from tests.stages.test_train import trainer_for
-from tests.stages.train_subject import BODY_FILE, HEIGHT, TINY, WIDTH, context_for, write_subject
+from stages.train.held_out import held_out_psnr, require_progress
+from tests.stages.train_subject import (
+    BODY_FILE,
+    HEIGHT,
+    TINY,
+    WIDTH,
+    change_loss,
+    context_for,
+    trainer_for,
+    write_subject,
+)
 
 SIZE = (HEIGHT, WIDTH)
 
@@ -71,7 +79,7 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
     clean = trainer_for(context_for(subject, tmp_path / "clean", **settings))
     steps(trainer, 8)
     steps(clean, 8)
-    scores = [one.held_out(clean.data.clip.split.test) for one in (trainer, clean)]
+    scores = [held_out_psnr(one, clean.data.clip.split.test) for one in (trainer, clean)]
     assert scores[0] > scores[1] - 6
 
 
@@ -114,7 +122,7 @@ def test_a_damaged_frame_among_good_ones_stops_the_run_by_its_name(subject, tmp_
 
 
 def test_one_frame_and_nothing_held_out(subject, tmp_path):
-    from pipeline.records import Split, write_split
+    from pipeline.clip.records import Split, write_split
 
     place = spoilt(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=()))
@@ -130,9 +138,9 @@ def test_a_loss_spike_does_not_move_the_weights_further_than_a_step(subject, tmp
     """Adam divides by the spike what the spike multiplied: a million times the loss, one step's length."""
     trainer = trainer_for(context_for(subject, tmp_path / "out", iterations=20))
     steps(trainer, 6)
-    original, weights = losses.l1, trainer.avatar.parameters
+    weights = trainer.avatar.parameters
     before = torch.nn.utils.parameters_to_vector(weights()).detach().clone()
-    monkeypatch.setattr(losses, "l1", lambda image, target: 1e6 * original(image, target))
+    change_loss(monkeypatch, "l1", lambda loss, pair: 1e6 * loss(*pair))
     trainer.step()
     moved = (torch.nn.utils.parameters_to_vector(weights()) - before).abs().max()
     assert moved < 12 * TINY.plane_learning_rate
@@ -143,8 +151,7 @@ def test_a_loss_spike_does_not_move_the_weights_further_than_a_step(subject, tmp
 
 def test_a_loss_of_the_largest_numbers_stops_by_name(subject, tmp_path, monkeypatch):
     trainer = trainer_for(context_for(subject, tmp_path / "out"))
-    original = losses.l1
-    monkeypatch.setattr(losses, "l1", lambda image, target: 1e38 * 100 * original(image, target))
+    change_loss(monkeypatch, "l1", lambda loss, pair: 1e38 * 100 * loss(*pair).mean())
     with pytest.raises(NotFiniteError, match="loss term 'l1' is inf at iteration 0, frame"):
         trainer.step()
 
@@ -152,14 +159,14 @@ def test_a_loss_of_the_largest_numbers_stops_by_name(subject, tmp_path, monkeypa
 def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_path, monkeypatch):
     """The loss is finite; its slope, the root's at nothing, is not."""
     context = context_for(subject, tmp_path / "out", checkpoint_every=2, iterations=8)
-    original, calls = losses.l1, []
+    calls = []
 
-    def rooted(image, target):
+    def rooted(loss, pair):
         calls.append(1)
-        value = original(image, target)
+        value = loss(*pair)
         return value + (value - value.detach()).square().sqrt() if len(calls) == 6 else value
 
-    monkeypatch.setattr(losses, "l1", rooted)
+    change_loss(monkeypatch, "l1", rooted)
     frame = schedule.drawn_frame(TINY.seed, (0, 1, 2, 3, 4), 5)
     with pytest.raises(NotFiniteError, match=f"the gradient of .* not finite at iteration 5, frame {frame} "):
         stage.run(context)
@@ -175,7 +182,7 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
 
 def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
     trainer = trainer_for(context_for(subject, tmp_path / "out", batch=2))
-    monkeypatch.setattr(objective, "ssim_loss", lambda image, target: losses.l1(image, target) * float("nan"))
+    change_loss(monkeypatch, "ssim", lambda loss, pair: loss(*pair) * float("nan"))
     with pytest.raises(NotFiniteError, match=r"loss term 'ssim' is nan at iteration 0, frames \d, \d;"):
         trainer.step()
 
@@ -211,7 +218,7 @@ def drift(subject, tmp_path, count, **settings):
     """The loss of every step, and the held-out PSNR at the end."""
     trainer = trainer_for(context_for(subject, tmp_path, iterations=count, **settings))
     taken = steps(trainer, count)
-    return np.array(taken), trainer.held_out(trainer.data.clip.split.test)
+    return np.array(taken), held_out_psnr(trainer, trainer.data.clip.split.test)
 
 
 def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
@@ -225,7 +232,7 @@ def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
 @pytest.mark.soak
 @pytest.mark.timeout(3000)
 def test_thousands_of_steps_on_one_frame(subject, tmp_path):
-    from pipeline.records import Split, write_split
+    from pipeline.clip.records import Split, write_split
 
     place = spoilt(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=(5,)))

@@ -9,7 +9,7 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
 from pipeline.body import load_body, mean_identity
-from pipeline.stage import Context
+from pipeline.run.stage import Context
 from stages.animate.run import run
 from stages.animate.settings import AnimateSettings
 from tests.stages.train_subject import BODY_FILE, write_subject

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from pipeline.body import load_body, load_landmarks, write_identity, write_poses
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import write_keypoints
-from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import write_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
 from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.turn import read_numbered_clip
 from stages.ingest.mannequin.appearance import make_appearance

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import Keypoints, empty_keypoints
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import Keypoints, empty_keypoints
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 384.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])

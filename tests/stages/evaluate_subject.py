@@ -1,25 +1,26 @@
 """A tiny subject for the evaluate stage: a blob of Gaussians, filmed by the renderer itself."""
 
 import dataclasses
+import functools
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from pipeline.body import Poses, write_poses
-from pipeline.camera import facing_camera
-from pipeline.curves import Curve
-from pipeline.frames import write_frame, write_mask
-from pipeline.json_files import write_json
-from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
-from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.curves import Curve
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
+from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, render
-from pipeline.stage import Context
-from pipeline.tables import write_table
-from stages.evaluate.assessment import Extras
-from stages.evaluate.evidence import read_evidence
+from stages.evaluate.evaluated_clip import read_evaluated_clip
+from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.run import evaluate
-from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
 from stages.fit.run import RESIDUALS_SCHEMA as RESIDUALS
 from stages.train.visibility_gate import write_visibility
@@ -28,14 +29,20 @@ from tests.plans import plan_of
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
 TEST = FRAMES[-3:]
 WIDTH, HEIGHT = 64, 48
+BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
+
+OPTIONAL = ("mesh", "second", "embedder", "other_cameras")
+
+body = functools.cache(functools.partial(load_body, BODY_FILE))
 
 
-def stand_in(rotation, expression, transl, time):
+def stand_in(pose, time):
     """A blob of 40 Gaussians that follows ``transl`` and leans with the root's rotation."""
+    transl = pose.transl
     generator = torch.Generator().manual_seed(7)
     draw = torch.rand(40, 3, generator=generator)
     means = (draw - 0.5) * torch.tensor([0.6, 0.8, 0.3]) + transl
-    means = means + torch.linalg.cross(rotation[:1].expand(40, 3), means - transl)
+    means = means + torch.linalg.cross(pose.rotation[:1].expand(40, 3), means - transl)
     quaternions = torch.tensor([[1.0, 0, 0, 0]]).expand(40, 4)
     scales = torch.full((40, 3), 0.09)
     return Gaussians(
@@ -43,9 +50,9 @@ def stand_in(rotation, expression, transl, time):
     )
 
 
-def wrong(rotation, expression, transl, time):
+def wrong(pose, time):
     """The same blob in other colours."""
-    right = stand_in(rotation, expression, transl, time)
+    right = stand_in(pose, time)
     return dataclasses.replace(right, colors=1 - right.colors)
 
 
@@ -59,7 +66,7 @@ def moving_poses(shift=0.0):
 
 
 @dataclasses.dataclass
-class Clip:
+class FilmedBlob:
     """A subject as the upstream stages publish it, filmed of the stand-in avatar."""
 
     root: object
@@ -83,11 +90,16 @@ class Clip:
             stage="evaluate",
         )
 
-    def evaluate(self, animate=stand_in, name="out", follow=None, extras=None, views=None, **settings):
-        context = self.context(name, **settings)
-        scorer = Scorer({}, context.settings.choices.background)
-        extras = extras or Extras()
-        evaluate(context, read_evidence(self.inputs), animate, follow or animate, scorer, extras, views)
+    def clip(self):
+        return read_evaluated_clip(self.inputs, body())
+
+    def evaluate(self, animate=stand_in, name="out", follow=None, **arguments):
+        """``arguments``: those of ``evaluate`` by their names; all others are settings."""
+        optional = {key: arguments.pop(key) for key in OPTIONAL if key in arguments}
+        context = self.context(name, **arguments)
+        choices = context.settings.choices
+        scorer = Scorer({}, choices.background, choices.render_mask)
+        evaluate(context, self.clip(), animate, follow or animate, scorer, **optional)
         return context.output
 
 
@@ -109,8 +121,8 @@ def make_clip(root, test=TEST, soft=False):
         folder.mkdir()
     ingest, fit, plan, train = inputs.values()
     camera, poses = facing_camera(WIDTH, HEIGHT, 70.0), moving_poses()
-    for row, frame in enumerate(FRAMES):
-        rendering = render(stand_in(poses.rotation[row], None, poses.transl[row], None), camera)
+    for frame in FRAMES:
+        rendering = render(stand_in(poses.pose(frame), None), camera)
         alpha = rendering.alpha if soft else (rendering.alpha > 0).float()
         color = rendering.color / rendering.alpha[..., None].clamp(min=1e-6) if soft else rendering.color
         write_frame(ingest / "frames", frame, (color.clamp(0, 1) * 255).round().byte().numpy())
@@ -122,6 +134,7 @@ def make_clip(root, test=TEST, soft=False):
     seconds = tuple(frame / 25 for frame in FRAMES)
     footage = Footage("blob.mp4", 128, 96, 25.0, 0.5, 14, 12, dropped, 2, seconds, {"masks": "made"})
     write_footage(ingest / "footage.json", footage)
+    write_identity(fit / "identity.safetensors", mean_identity(body()), body())
     write_poses(fit / "poses.parquet", poses)
     write_poses(train / "poses.parquet", poses)
     errors = {"frame": np.array(FRAMES[:2], np.int32), "group": np.array(["body", "face"], dtype=object)}
@@ -140,4 +153,4 @@ def make_clip(root, test=TEST, soft=False):
     )
     write_json(train / "gate.json", {"tau": 0.5, "why": "20% of the body is under 0.50", "definition": "x"})
     write_plan(plan / "plan.json", plan_of(pose_heads=False, test_time_refinement=False))
-    return Clip(root, inputs)
+    return FilmedBlob(root, inputs)

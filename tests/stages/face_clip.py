@@ -9,7 +9,7 @@ import roma
 import torch
 
 from pipeline.body import is_part, mean_identity, rest_joints
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
 from stages.fit.face.target import FaceModel
 from stages.fit.views import Views, stack
 

@@ -19,8 +19,8 @@ from pipeline.body import (
     mean_identity,
     pose_body,
 )
-from pipeline.camera import Camera, facing_camera, project
-from pipeline.keypoints import Keypoints, empty_keypoints
+from pipeline.clip.camera import Camera, facing_camera, project
+from pipeline.clip.keypoints import Keypoints, empty_keypoints
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import initial_parameters
 from stages.fit.objective import Objective

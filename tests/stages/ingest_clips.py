@@ -11,7 +11,7 @@ import av
 import cv2
 import numpy as np
 
-from pipeline.stage import Context
+from pipeline.run.stage import Context
 from stages.ingest.settings import IngestSettings
 
 

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pipeline.body import BodyModel, Identity, Poses, load_body, load_landmarks, pose_body, rest_joints
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from stages.ingest.mannequin.footage import Filming
 from stages.ingest.mannequin.scene import film, make_background
 from stages.ingest.mannequin.spec import MannequinSpec

@@ -10,9 +10,9 @@ import roma
 import torch
 
 from pipeline.body import PARTS, joint_index, load_body, mean_identity, pose_body, rest_joints
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.records import read_cameras
 from pipeline.splat import Gaussians, read_ply, render
 from stages.animate.actor import Known, legs_share
 from stages.animate.layers import decode_srgb, layers_of

@@ -17,12 +17,12 @@ from pipeline.body import (
     rest_joints,
     vertex_normals,
 )
-from pipeline.camera import project
+from pipeline.clip.camera import project
+from pipeline.clip.frames import read_frame, read_mask, write_frame, write_video
+from pipeline.clip.keypoints import FACE, read_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_frame, write_video
-from pipeline.keypoints import FACE, read_keypoints
-from pipeline.plan import write_plan
-from pipeline.records import read_cameras
 from pipeline.texture import Seen, robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary import texture

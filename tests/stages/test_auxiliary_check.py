@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipeline.body import PARTS, part_labels, posed_vertices, rasterize
-from pipeline.frames import write_frame
+from pipeline.clip.frames import write_frame
 from stages.auxiliary import check
 from stages.auxiliary import run as stage
 from stages.auxiliary.look import Look

@@ -9,20 +9,22 @@ import pytest
 import torch
 from rich.console import Console
 
-from pipeline.body import Poses, write_poses
-from pipeline.curves import read_curve
+from pipeline.body import Pose, Poses, write_poses
+from pipeline.clip.curves import read_curve
+from pipeline.clip.frames import write_mask, write_png
+from pipeline.clip.spread import spread_end_to_end
 from pipeline.errors import UserError
-from pipeline.frames import write_mask, write_png
 from pipeline.metrics import PSNR_CAP
+from pipeline.orbit_cameras import relaxed_pose
 from pipeline.splat import read_ply
-from pipeline.spread import spread_end_to_end
-from pipeline.turntable import relaxed_pose
-from stages.evaluate import STAGE, curve, records
-from stages.evaluate.evidence import read_evidence
+from stages.evaluate import STAGE
+from stages.evaluate.frame_metrics import Scorer
+from stages.evaluate.report.plots import plot_training, plot_visibility
+from stages.evaluate.report.terminal import show_summary
 from stages.evaluate.run import evaluate, report_place
-from stages.evaluate.scoring import Scorer
 from stages.evaluate.settings import EvaluateSettings
-from stages.evaluate.summary import show_summary
+from stages.evaluate.upstream import VISIBILITY as VISIBILITY_READ
+from stages.evaluate.upstream import read_gate
 from stages.train.visibility_gate import SCHEMA as VISIBILITY
 from tests.stages.evaluate_subject import (
     FRAMES,
@@ -100,7 +102,7 @@ def test_summary_holds_the_means_of_the_rows(published):
 
 def test_the_ply_holds_the_turned_avatar(published):
     found = read_ply(published / "avatar.ply")
-    expected = stand_in(relaxed_pose(1.0), torch.zeros(4), torch.zeros(3), None)
+    expected = stand_in(Pose(relaxed_pose(1.0), torch.zeros(4), torch.zeros(3)), None)
     assert torch.allclose(found.means, expected.means, atol=1e-6)
 
 
@@ -120,10 +122,8 @@ def test_a_wrong_avatar_scores_low_and_is_not_marked_best(clip):
 
 def test_held_out_frames_are_shown_in_the_fits_pose_and_training_frames_in_the_refined(clip):
     write_poses(clip.inputs["train"] / "poses.parquet", moving_poses(shift=5.0))
-    evidence = read_evidence(clip.inputs)
-    assert float(evidence.pose(TEST[0])[2][0]) < 1 < float(evidence.pose(FRAMES[0])[2][0])
-    assert evidence.seconds(TEST[0]) == TEST[0] / 25
-    assert evidence.seconds(999) is None
+    evaluated = clip.clip()
+    assert float(evaluated.pose(TEST[0]).transl[0]) < 1 < float(evaluated.pose(FRAMES[0]).transl[0])
 
 
 def test_a_frame_without_pose_says_what_to_run(clip):
@@ -131,7 +131,7 @@ def test_a_frame_without_pose_says_what_to_run(clip):
     fewer = Poses(FRAMES[:-1], poses.rotation[:-1], poses.expression[:-1], poses.transl[:-1])
     for stage in ("fit", "train"):
         write_poses(clip.inputs[stage] / "poses.parquet", fewer)
-    with pytest.raises(UserError, match=f"frame {FRAMES[-1]} has no pose.*fit"):
+    with pytest.raises(UserError, match=f"no pose for frame {FRAMES[-1]}.*fit"):
         clip.evaluate()
 
 
@@ -189,7 +189,7 @@ def test_times_and_settings_of_the_stages_are_shown_where_they_are_recorded(clip
 
 def test_what_users_name_is_escaped(clip):
     context = dataclasses.replace(clip.context(), subject="<script>x</script>")
-    evaluate(context, read_evidence(clip.inputs), stand_in, stand_in, Scorer({}))
+    evaluate(context, clip.clip(), stand_in, stand_in, Scorer({}))
     report = (context.output / "report.html").read_text()
     assert "<script>x" not in report and report.count("<script") == 1
 
@@ -204,24 +204,26 @@ def test_the_fits_overlay_is_embedded(clip, name, kind):
 def test_curve_and_visibility_are_read_as_train_writes_them(clip):
     lines = read_curve(clip.inputs["train"] / "curve.parquet", "run train again")
     assert lines["psnr"] == [(10, 30.0), (20, 40.0), (30, 50.0)]
-    gate = records.read_gate(clip.inputs["train"])
+    gate = read_gate(clip.inputs["train"])
     assert (gate.kept, gate.vertices, gate.tau) == (40, 50, 0.5) and gate.scores.sum() == 40
-    assert all(VISIBILITY.field(one.name) == one for one in records.VISIBILITY)
+    assert all(VISIBILITY.field(one.name) == one for one in VISIBILITY_READ)
     with pytest.raises(UserError, match="train stage again"):
         read_curve(clip.inputs["train"] / "visibility.parquet", "run the train stage again")
 
 
-def test_the_curve_adds_the_regularisers_up_and_is_drawn_the_same_each_time():
+def test_the_training_plots_show_the_metric_and_the_losses_and_are_drawn_the_same_each_time():
     lines = {
         "l1": [(1, 0.5)],
         "offset": [(1, 0.25), (2, 0.5)],
         "pose_offset": [(2, 0.25)],
         "psnr": [(2, 20.0)],
     }
-    assert curve._loss_lines(lines) == {"L1": [(1, 0.5)], "regularisers": [(1, 0.25), (2, 0.75)]}
-    assert curve.draw_curve(lines) == curve.draw_curve(lines)
-    assert curve.draw_curve({}) == curve.draw_curve({"gaussians": [(1, 40.0)]}) == []
-    assert len(curve.draw_curve(lines)) == 2
+    plots = plot_training(lines)
+    assert len(plots) == 2 and plots == plot_training(lines)
+    # Every loss term but L1 and SSIM is part of the regularisers: two lines, and 0.75 at iteration 2.
+    summed = {"l1": [(1, 0.5)], "regulariser": [(1, 0.25), (2, 0.75)], "psnr": [(2, 20.0)]}
+    assert plots == plot_training(summed) != plot_training({**lines, "offset": [(1, 0.25)]})
+    assert plot_training({}) == plot_training({"gaussians": [(1, 40.0)]}) == []
 
 
 # The terminal
@@ -268,6 +270,6 @@ def test_the_plan_and_the_scores_are_shown(clip):
 
 
 def test_nothing_counted_draws_nothing():
-    assert curve.draw_scores(np.zeros(50), 0.0) == []
+    assert plot_visibility(np.zeros(50), 0.0) == []
     scores = np.linspace(0, 1, 50)
-    assert curve.draw_scores(scores, 0.3) == curve.draw_scores(scores, 0.3)
+    assert plot_visibility(scores, 0.3) == plot_visibility(scores, 0.3)

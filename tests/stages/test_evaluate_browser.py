@@ -5,11 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.frames import write_png
-from stages.evaluate.assessment import Extras
-from stages.evaluate.evidence import read_evidence
-from stages.evaluate.scoring import Score
-from stages.evaluate.second_mask import SecondMasks, edge
+from pipeline.clip.frames import write_png
+from stages.evaluate.scores import TableRow
+from stages.evaluate.second_mask import SecondMask, edge
 from tests.stages.evaluate_subject import TEST, make_clip
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -35,10 +33,10 @@ def report(tmp_path_factory):
     clip = make_clip(tmp_path_factory.mktemp("blob"), soft=True)
     write_png(clip.inputs["fit"] / "overlay.png", np.full((48, 64, 3), 90, np.uint8))
     write_png(clip.inputs["train"] / "visibility.png", np.full((48, 64, 3), 120, np.uint8))
-    evidence = read_evidence(clip.inputs)
-    second = SecondMasks({frame: edge(evidence.mask(frame)) for frame in TEST}, "the same, 1 px smaller")
-    views = [Score(2, "views", "avatar", name, 20.0, "back") for name in ("psnr", "psnr_unseen")]
-    output = clip.evaluate(extras=Extras(second=second), views=views, refine_test_poses="on", refine_steps=2)
+    evaluated = clip.clip()
+    second = SecondMask(evaluated, {frame: edge(evaluated.mask(frame)) for frame in TEST}, "1 px smaller")
+    rows = [TableRow(2, "views", "avatar", name, 20.0, "back") for name in ("psnr", "psnr_unseen")]
+    output = clip.evaluate(second=second, other_cameras=rows, refine_test_poses="on", refine_steps=2)
     return output / "report.html"
 
 

@@ -1,20 +1,23 @@
 """A painted body: its textured mesh, and cameras behind it that no training frame had."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
-from pipeline.body import load_body, mean_identity, write_identity, write_poses
-from pipeline.camera import Camera
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.body import load_body, write_identity, write_poses
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.records import write_cameras
 from pipeline.metrics import interior, psnr
-from pipeline.records import write_cameras
 from pipeline.splat import render
 from stages.evaluate.baselines import mean_frame
-from stages.evaluate.evidence import read_evidence
-from stages.evaluate.mesh import textured_mesh
-from stages.evaluate.views import read_filmed, score_views
+from stages.evaluate.evaluated_clip import read_evaluated_clip
+from stages.evaluate.methods import AVATAR, AvatarMethod
+from stages.evaluate.other_cameras import read_true_surface, score_other_cameras
+from stages.evaluate.textured_mesh import textured_mesh
 from tests.stages.train_subject import BODY_FILE, moving_poses, painted_avatar, write_subject
 
 
@@ -37,62 +40,56 @@ def subject(tmp_path_factory):
     write_keypoints(ingest / "keypoints.parquet", empty_keypoints(np.arange(len(poses.frames))))
     write_poses(ingest / "truth_poses.parquet", poses)
     write_identity(ingest / "truth_surface.safetensors", avatar.identity, load_body(BODY_FILE))
-    evidence = read_evidence({name: folder / name for name in ("ingest", "fit", "plan", "train")})
+    inputs = {name: folder / name for name in ("ingest", "fit", "plan", "train")}
+    clip = read_evaluated_clip(inputs, load_body(BODY_FILE))
     view = ingest / "views" / "back"
     for name in ("frames", "masks"):
         (view / name).mkdir(parents=True)
-    camera = behind(evidence.cameras[0])
+    camera = behind(clip.camera(0))
     with torch.no_grad():
-        rendering = render(avatar.gaussians(*evidence.pose(0)), camera)
+        rendering = render(avatar.gaussians(clip.pose(0)), camera)
     write_frame(view / "frames", 0, (rendering.color.clamp(0, 1).numpy() * 255).astype(np.uint8))
     write_mask(view / "masks", 0, (rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8))
     write_cameras(view / "cameras.parquet", {0: camera})
-    return evidence, avatar
+    return clip, avatar
 
 
 def test_the_textured_mesh_comes_nearer_than_a_still(subject):
-    evidence, body = subject[0], load_body(BODY_FILE)
-    seen = []
-    mesh = textured_mesh(
-        evidence, body, mean_identity(body), evidence.split.train[::2], lambda: seen.append(1)
-    )
-    assert len(seen) == 3 and 0.02 < mesh.known < 0.5
-    held_out = evidence.split.test[0]
-    truth = evidence.person(held_out)
-    drawn = mesh.on(evidence.pose(held_out), evidence.cameras[held_out])("black")
-    still = mean_frame(evidence.person, evidence.split.train)
-    inside = interior(evidence.mask(held_out))
+    clip, advanced = subject[0], []
+    mesh = textured_mesh(clip, clip.split.train[::2], lambda: advanced.append(1))
+    assert len(advanced) == 3 and 0.02 < mesh.known < 0.5
+    held_out = clip.split.test[0]
+    truth, drawn = clip.person(held_out), mesh.render(held_out)("black")
+    still = mean_frame(clip.person, clip.split.train)
+    inside = interior(clip.mask(held_out))
     assert psnr(drawn, truth, inside) > psnr(still, truth, inside) + 3
 
 
 def test_what_no_training_frame_shows_is_told_apart(subject):
-    evidence, avatar = subject
-    body = load_body(BODY_FILE)
-    filmed = read_filmed(evidence, body)
-    assert 0.05 < filmed.seen.mean() < 0.6
+    clip, avatar = subject
+    true = read_true_surface(clip)
+    assert 0.05 < true.seen.mean() < 0.6
     # From the front nearly everything is seen, from behind hardly anything.
-    front = filmed.unseen_pixels(evidence.cameras[0], 0).sum()
-    back = filmed.unseen_pixels(behind(evidence.cameras[0]), 0).sum()
+    front = true.unseen_pixels(clip.camera(0), 0).sum()
+    back = true.unseen_pixels(behind(clip.camera(0)), 0).sum()
     assert int(front) < 20 and int(back) > 200
 
-    def wrong_behind(rotation, expression, transl, time):
+    def wrong_behind(pose, time):
         """The avatar that was filmed, in other colours where no frame showed it."""
-        gaussians = avatar.gaussians(rotation, expression, transl, time)
-        gaussians.colors[~torch.from_numpy(filmed.seen)] = 0.0
+        gaussians = avatar.gaussians(pose, time)
+        gaussians.colors[~torch.from_numpy(true.seen)] = 0.0
         return gaussians
 
-    with torch.no_grad():
-        right, wrong = (
-            {one.metric: one.value for one in score_views(evidence, animate, None, filmed, "black")}
-            for animate in (avatar.gaussians, wrong_behind)
-        )
+    methods = [AvatarMethod(AVATAR, clip, animate, ()) for animate in (avatar.gaussians, wrong_behind)]
+    right, wrong = (
+        {row.metric: row.value for row in score_other_cameras(clip, [method], true, "black")}
+        for method in methods
+    )
     assert right["psnr_unseen"] > 40 and right["unseen_share"] > 0.5
     assert wrong["psnr_unseen"] < 20 and wrong["psnr"] < right["psnr"] - 10
 
 
 def test_a_clip_without_truth_has_none(tmp_path, subject):
-    import dataclasses
-
     bare = dataclasses.replace(subject[0], folder=tmp_path)
-    assert read_filmed(bare, load_body(BODY_FILE)) is None
-    assert score_views(bare, None, None, None, "black") == []
+    assert read_true_surface(bare) is None
+    assert list(score_other_cameras(bare, [], None, "black")) == []

@@ -5,14 +5,16 @@ import pytest
 import roma
 import torch
 
-from pipeline.boxes import Box
-from pipeline.camera import project, to_camera
+from pipeline.body import Pose
+from pipeline.clip.camera import project, to_camera
+from pipeline.clip.spread import spread_end_to_end
+from pipeline.orbit_cameras import Extent, orbit, relaxed_pose, visible_extent
 from pipeline.splat import Gaussians
-from pipeline.turntable import Extent, orbit, relaxed_pose, visible_extent
 from stages.evaluate.baselines import mean_frame, nearest_frames
-from stages.evaluate.pictures import compare, comparison_sheet
-from stages.evaluate.rendering import turn_pictures
-from stages.evaluate.scoring import Score, table
+from stages.evaluate.report.pictures import compare, comparison_sheet, person_box
+from stages.evaluate.report.videos import turntable_pictures
+from stages.evaluate.scores import TableRow, score_table
+from stages.evaluate.statistics import means
 from tests.stages.evaluate_subject import stand_in
 
 
@@ -42,10 +44,16 @@ def test_means_leave_out_what_is_not_defined():
         ("psnr_interior", 1, float("nan")),
         ("psnr_interior", 2, 31.0),
     ]
-    scores = [Score(frame, "test", "avatar", metric, value) for metric, frame, value in rows]
-    assert table(scores, ["psnr", "psnr_interior", "ssim"]) == {
+    table = score_table(TableRow(frame, "test", "avatar", metric, value) for metric, frame, value in rows)
+    assert means(table, ["psnr", "psnr_interior", "ssim"]) == {
         "test": {"avatar": {"psnr": 25.0, "psnr_interior": 31.0, "ssim": None}}
     }
+
+
+def test_evenly_spaced():
+    assert spread_end_to_end(range(10), 4) == [0, 3, 6, 9]
+    assert spread_end_to_end(range(10), 1) == [5]
+    assert spread_end_to_end(range(3), 5) == [0, 1, 2]
 
 
 def test_the_arms_hang_in_the_relaxed_pose():
@@ -58,7 +66,7 @@ def test_the_arms_hang_in_the_relaxed_pose():
 
 
 def test_extent_counts_only_what_is_seen():
-    blob = stand_in(torch.zeros(55, 3), None, torch.tensor([1.0, 2.0, 3.0]), None)
+    blob = stand_in(Pose(torch.zeros(55, 3), torch.zeros(4), torch.tensor([1.0, 2.0, 3.0])), None)
     far = dataclasses.replace(blob, means=blob.means + 50, opacities=torch.zeros(40))
     both = Gaussians(*(torch.cat(pair) for pair in zip(blob.tensors(), far.tensors(), strict=True)))
     extent = visible_extent(both)
@@ -100,7 +108,7 @@ def test_the_turn_starts_at_the_face_and_goes_to_the_left_side():
     one = Gaussians(
         means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.05), torch.zeros(1, 3), torch.ones(1)
     )
-    dark = next(turn_pictures(one, cameras[:1])).astype(int).sum(-1)
+    dark = next(turntable_pictures(one, cameras[:1])).astype(int).sum(-1)
     row, column = np.unravel_index(dark.argmin(), dark.shape)
     assert row < 80 and column > 60
 
@@ -110,7 +118,14 @@ def test_comparison_by_hand():
     image[5, 6] = 0.2
     one = compare(4, truth, image, 3.0, 31.0)
     assert one.error[5, 6].tolist() == [153, 153, 153] and one.error.sum() == 3 * 153
-    cropped = one.cropped(Box(6, 5, 10, 9))
+    cropped = one.cropped((6, 5, 10, 9))
     assert cropped.render.shape == (4, 4, 3) and cropped.render[0, 0, 0] == 51
     sheet = comparison_sheet([one, one], 3.0)
     assert sheet.shape[1] == 3 * 30 + 2 * 6 and sheet.dtype == np.uint8
+
+
+def test_the_persons_box():
+    mask = np.zeros((50, 60), np.uint8)
+    mask[20:30, 5:40] = 255
+    assert person_box([mask], margin=8) == (0, 12, 48, 38)
+    assert person_box([np.zeros((5, 7), np.uint8)]) == (0, 0, 7, 5)

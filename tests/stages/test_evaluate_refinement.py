@@ -11,23 +11,24 @@ import pytest
 import torch
 from rich.console import Console
 
-from pipeline.body import read_poses, write_poses
-from pipeline.camera import project
-from pipeline.frames import read_mask, write_mask
-from pipeline.keypoints import empty_keypoints, write_keypoints
+from pipeline.body import Pose, read_poses, write_poses
+from pipeline.clip.camera import project
+from pipeline.clip.frames import read_mask, write_mask
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.plan import write_plan
+from pipeline.clip.records import read_cameras
+from pipeline.config.evaluation_protocol import PROTOCOLS
 from pipeline.metrics import psnr
-from pipeline.plan import write_plan
-from pipeline.protocols import PROTOCOLS
-from pipeline.records import read_cameras
-from stages.evaluate.evidence import read_evidence
-from stages.evaluate.refinement import NONE, called_for, refine, refined_pose
-from stages.evaluate.rendering import follower, render_frame, scored_picture
+from stages.evaluate.evaluated_clip import read_evaluated_clip
+from stages.evaluate.methods import AVATAR, AvatarMethod, pose_gradient_animation
+from stages.evaluate.report.terminal import show_summary
 from stages.evaluate.settings import EvaluateSettings
-from stages.evaluate.summary import protocol, show_summary
+from stages.evaluate.summary import protocol_sentences
+from stages.evaluate.test_pose_refinement import NOT_REFINED, is_called_for, refine, refined_pose
 from tests.plans import plan_of
 from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
+from tests.stages.train_subject import BODY_FILE, painted_avatar, write_subject
 from tests.stages.train_subject import moving_poses as body_poses
-from tests.stages.train_subject import painted_avatar, write_subject
 
 
 @pytest.fixture
@@ -89,9 +90,9 @@ def test_on_white_every_picture_stands_on_white_and_refines_there(clip):
     means = held_out(clip.evaluate(background="white", refine_test_poses="on", refine_steps=30))
     assert means["mean_frame"]["psnr"] < means["nearest_frame"]["psnr"] < means["avatar"]["psnr"]
     assert means["avatar_refined"]["psnr"] > means["avatar"]["psnr"] + 5
-    evidence = read_evidence(clip.inputs)
-    drawn = scored_picture(render_frame(stand_in, evidence, TEST[0]), "white")
-    for picture in (evidence.person(TEST[0], "white"), drawn):
+    evaluated = clip.clip()
+    drawn = AvatarMethod(AVATAR, evaluated, stand_in, TEST).render(TEST[0])("white")
+    for picture in (evaluated.person(TEST[0], "white"), drawn):
         assert torch.equal(picture[0, 0], torch.ones(3))  # a corner where nobody stands
 
 
@@ -141,8 +142,8 @@ def test_a_plan_that_does_not_call_for_it_is_obeyed_and_quoted(clip):
 @pytest.mark.parametrize("planned", [True, False])
 def test_the_setting_overrules_the_plan(asked, planned):
     plan = plan_of(test_time_refinement=planned)
-    assert called_for(EvaluateSettings(refine_test_poses=asked), plan) == (asked == "on")
-    assert called_for(EvaluateSettings(), plan) == planned
+    assert is_called_for(EvaluateSettings(refine_test_poses=asked), plan) == (asked == "on")
+    assert is_called_for(EvaluateSettings(), plan) == planned
 
 
 def test_without_held_out_frames_nothing_is_refined(tmp_path):
@@ -158,11 +159,12 @@ def test_without_held_out_frames_nothing_is_refined(tmp_path):
 def test_a_frame_that_is_not_finite_keeps_its_fitted_pose_and_says_so(clip, capsys):
     poses = moving_poses()
 
-    def follow(rotation, expression, transl, time):
-        gaussians = stand_in(rotation, expression, transl, time)
+    def follow(pose, time):
+        gaussians = stand_in(pose, time)
         if time != TEST[1] / 25:
             return gaussians
-        rooted = (transl - transl.detach()).square().sum().sqrt()  # 0, and its slope is not a number
+        change = pose.transl - pose.transl.detach()
+        rooted = change.square().sum().sqrt()  # 0, and its slope is not a number
         return dataclasses.replace(gaussians, means=gaussians.means + rooted)
 
     output = clip.evaluate(follow=follow, refine_test_poses="on", refine_steps=3)
@@ -176,7 +178,7 @@ def test_a_frame_that_is_not_finite_keeps_its_fitted_pose_and_says_so(clip, caps
 
 
 def fitted_pose():
-    return torch.zeros(55, 3), torch.zeros(4), torch.zeros(3)
+    return Pose(torch.zeros(55, 3), torch.zeros(4), torch.zeros(3))
 
 
 def test_a_loss_or_gradient_that_is_not_finite_stops():
@@ -184,28 +186,29 @@ def test_a_loss_or_gradient_that_is_not_finite_stops():
 
     def breaks(pose):
         calls.append(1)
-        return pose[2].sum() * (math.nan if len(calls) == 3 else 1)
+        return pose.transl.sum() * (math.nan if len(calls) == 3 else 1)
 
     assert refined_pose(breaks, fitted_pose(), 10) is None and len(calls) == 3
     # The square root's slope at zero is infinite, its value is not.
-    assert refined_pose(lambda pose: pose[2].abs().sum().sqrt(), fitted_pose(), 10) is None
+    assert refined_pose(lambda pose: pose.transl.abs().sum().sqrt(), fitted_pose(), 10) is None
 
 
 def test_the_best_pose_met_is_kept():
     start = fitted_pose()
     # Adam's first step of 1e-3 leaps over this minimum.
-    found = refined_pose(lambda pose: (pose[2] - 1e-5).abs().sum(), start, 3)
-    assert torch.equal(found[2], start[2])
-    nearer = refined_pose(lambda pose: (pose[2] - 0.02).square().sum(), start, 60)
-    assert torch.allclose(nearer[2], torch.full((3,), 0.02), atol=2e-3)
-    assert torch.equal(nearer[0], start[0])  # what the loss does not look at stays
+    found = refined_pose(lambda pose: (pose.transl - 1e-5).abs().sum(), start, 3)
+    assert torch.equal(found.transl, start.transl)
+    nearer = refined_pose(lambda pose: (pose.transl - 0.02).square().sum(), start, 60)
+    assert torch.allclose(nearer.transl, torch.full((3,), 0.02), atol=2e-3)
+    assert torch.equal(nearer.rotation, start.rotation)  # what the loss does not look at stays
 
 
 @pytest.mark.parametrize("mask", [0, 255], ids=["nobody", "everything"])
 def test_a_useless_mask_leaves_finite_poses(clip, mask):
     write_mask(clip.inputs["ingest"] / "masks", TEST[0], np.full((HEIGHT, WIDTH), mask, np.uint8))
-    poses = refine(read_evidence(clip.inputs), stand_in, "black", 4, lambda: None).poses
-    assert all(bool(part.isfinite().all()) for pose in poses.values() for part in pose)
+    poses = refine(clip.clip(), stand_in, "black", 4, lambda: None).poses
+    for pose in poses.values():
+        assert all(bool(part.isfinite().all()) for part in (pose.rotation, pose.expression, pose.transl))
 
 
 # A body
@@ -220,31 +223,33 @@ def subject(tmp_path_factory):
     frames = np.array(sorted(read_cameras(folder / "ingest" / "cameras.parquet")))
     write_keypoints(folder / "ingest" / "keypoints.parquet", empty_keypoints(frames))
     write_poses(folder / "train" / "poses.parquet", body_poses())
-    return read_evidence({name: folder / name for name in ("ingest", "fit", "plan", "train")})
+    inputs = {name: folder / name for name in ("ingest", "fit", "plan", "train")}
+    return read_evaluated_clip(inputs, BODY_FILE)
 
 
-def score(evidence, animate, pose):
-    frame = evidence.split.test[0]
-    return psnr(scored_picture(render_frame(animate, evidence, frame, pose)), evidence.person(frame))
+def score(clip, animate, pose):
+    frame = clip.split.test[0]
+    shown = AvatarMethod(AVATAR, clip, animate, [frame], {frame: pose}).render(frame)
+    return psnr(shown("black"), clip.person(frame))
 
 
 @torch.no_grad()
-def off_by(evidence, animate, pose):
+def off_by(clip, animate, pose):
     """How far the Gaussians inside the picture are from where they were filmed, a mean in pixels."""
-    camera = evidence.cameras[evidence.split.test[0]]
-    true = project(camera, animate(*evidence.pose(evidence.split.test[0]), None).means)
+    camera = clip.camera(clip.split.test[0])
+    true = project(camera, animate(clip.pose(clip.split.test[0]), None).means)
     seen = ((true > 0) & (true < torch.tensor([camera.width, camera.height]))).all(1)
-    return float((project(camera, animate(*pose, None).means) - true)[seen].norm(dim=1).mean())
+    return float((project(camera, animate(pose, None).means) - true)[seen].norm(dim=1).mean())
 
 
 def test_a_displaced_body_comes_back_and_the_networks_stay(subject):
     poses = body_poses()
     poses.rotation[-1, 15] += torch.tensor([0.05, 0.08, 0.0])
     poses.transl[-1] += torch.tensor([0.012, -0.01, 0.0])
-    displaced = dataclasses.replace(subject, fitted=poses)
+    displaced = dataclasses.replace(subject, poses=poses)
     avatar = painted_avatar()
     networks = {name: value.numpy().tobytes() for name, value in avatar.state_dict().items()}
-    animate, frame = follower(avatar), subject.split.test[0]
+    animate, frame = pose_gradient_animation(avatar), subject.split.test[0]
     before, after = displaced.pose(frame), refine(displaced, animate, "black", 24, lambda: None).poses[frame]
     assert score(subject, animate, after) > score(subject, animate, before) + 3
     far = off_by(subject, animate, before)  # pixels
@@ -254,11 +259,11 @@ def test_a_displaced_body_comes_back_and_the_networks_stay(subject):
 
 
 def test_a_perfect_pose_is_left_alone(subject):
-    animate, frame = follower(painted_avatar()), subject.split.test[0]
+    animate, frame = pose_gradient_animation(painted_avatar()), subject.split.test[0]
     found = refine(subject, animate, "black", 6, lambda: None).poses[frame]
     assert score(subject, animate, found) > score(subject, animate, subject.pose(frame)) - 0.1
-    assert float((found[2] - subject.pose(frame)[2]).abs().max()) < 0.003  # metres
+    assert float((found.transl - subject.pose(frame).transl).abs().max()) < 0.003  # metres
 
 
 def test_the_protocol_names_what_was_done():
-    assert "refined" not in protocol(PROTOCOLS["ours"], NONE)
+    assert "refined" not in protocol_sentences(PROTOCOLS["ours"], NOT_REFINED)

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.turntable import relaxed_pose
-from pipeline.versions import PACKAGES, commit, package_version, versions
-from stages.evaluate.motion import motion_pictures, motion_poses
-from stages.evaluate.verdict import Sides, limits, quality, turned, verdict
+from pipeline.orbit_cameras import relaxed_pose
+from pipeline.run.versions import PACKAGES, commit, package_version, versions
+from stages.evaluate.report.videos import motion_pictures, motion_poses
+from stages.evaluate.verdict import ClipCoverage, limits, quality, turned, verdict
 from tests.stages.evaluate_subject import stand_in
 
-WHOLE = Sides(unmodelled=0.0, azimuths=(), fit_pixels=None)
+WHOLE = ClipCoverage(unmodelled=0.0, azimuths=(), fit_pixels=None)
 
 
 def summary(avatar=30.0, over=None, train=None, **methods):
@@ -95,15 +95,15 @@ def test_hands_are_named_where_they_are_much_worse_than_the_rest():
 
 
 def test_what_one_sees_who_turns_it():
-    assert turned(WHOLE) == "" and turned(Sides(0.0, (30.0,), None)) == ""
-    back = turned(Sides(0.65, (90.0, 120.0, 150.0, 180.0, 210.0), None))
+    assert turned(WHOLE) == "" and turned(ClipCoverage(0.0, (30.0,), None)) == ""
+    back = turned(ClipCoverage(0.65, (90.0, 120.0, 150.0, 180.0, 210.0), None))
     assert back.startswith("Turned: 5 of 12 directions were never filmed, the back among them")
     assert "65% of the body" in back
-    assert turned(Sides(0.2, (), None)).startswith("20% of the body")
+    assert turned(ClipCoverage(0.2, (), None)).startswith("20% of the body")
 
 
 def test_the_fits_error_is_said_and_empty_sentences_are_left_out():
-    assert verdict(summary(), Sides(0.0, (), 3.61)) == [
+    assert verdict(summary(), ClipCoverage(0.0, (), 3.61)) == [
         "30.0 dB on frames it never saw.",
         "The fit is off by 3.6 px.",
     ]

@@ -13,10 +13,10 @@ import torch
 import trimesh
 
 from pipeline.body import joint_index, pose_body, read_identity, read_poses, rest_vertices
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import write_keypoints
+from pipeline.clip.records import Footage, write_cameras, write_footage
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import write_keypoints
-from pipeline.records import Footage, write_cameras, write_footage
 from stages.fit.adam import optimise
 from stages.fit.registration import register
 from stages.fit.run import run

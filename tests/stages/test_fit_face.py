@@ -8,7 +8,7 @@ import pytest
 import roma
 import torch
 
-from pipeline.keypoints import empty_keypoints
+from pipeline.clip.keypoints import empty_keypoints
 from pipeline.numba_kernels import threads
 from stages.fit import terms
 from stages.fit.face import fit_face

@@ -8,8 +8,8 @@ import roma
 import torch
 
 from pipeline.body import locate, mean_identity, pose_body
-from pipeline.camera import facing_camera, project
-from pipeline.keypoints import FACE, LEFT_HAND, empty_keypoints
+from pipeline.clip.camera import facing_camera, project
+from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints
 from stages.fit.face_direction import TURNED, mesh_facing, points_facing, pose_facing
 from stages.fit.hand_trust import trusted_flat_hands
 from stages.fit.observations import detected, observe

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipeline.body import mean_identity, pose_body, read_identity, read_poses
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
 from pipeline.pose_files import (
     RECORD,
@@ -20,7 +20,7 @@ from pipeline.pose_files import (
     write_peer_files,
     write_record,
 )
-from pipeline.stage import Context
+from pipeline.run.stage import Context
 from stages.fit.initial_poses import given_identity
 from stages.fit.run import run
 from stages.fit.settings import FitSettings

@@ -20,8 +20,8 @@ from pipeline.body import (
     rest_joints,
     rest_vertices,
 )
-from pipeline.camera import facing_camera, to_camera
-from pipeline.keypoints import empty_keypoints
+from pipeline.clip.camera import facing_camera, to_camera
+from pipeline.clip.keypoints import empty_keypoints
 from pipeline.pose_files import read_hand_mean, read_initial_poses, tool_joints, write_peer_files
 from pipeline.pose_files.coefficients import is_official_smplx
 from stages.fit.face_offset import on_skin, spread_matrix

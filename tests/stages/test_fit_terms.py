@@ -9,7 +9,7 @@ import roma
 import torch
 
 from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
-from pipeline.guard import NotFiniteError
+from pipeline.finite import NotFiniteError
 from stages.fit import terms
 from stages.fit.adam import rate
 from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import empty_keypoints
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints
 from stages.ingest.cameras.choose import choose_cameras
 from stages.ingest.cameras.motion import MOVING, measure_motion
 from stages.ingest.cameras.scale import metric_scale, person_places

@@ -12,11 +12,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pipeline.camera import Camera, facing_camera, project
+from pipeline.clip.camera import Camera, facing_camera, project
+from pipeline.clip.frames import read_frame, write_frame, write_mask
+from pipeline.clip.keypoints import empty_keypoints, read_keypoints
+from pipeline.clip.records import read_cameras, read_footage, write_cameras
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, write_frame, write_mask
-from pipeline.keypoints import empty_keypoints, read_keypoints
-from pipeline.records import read_cameras, read_footage, write_cameras
 from stages.ingest.cameras.calibration import CalibratedCamera, open_calibration, pinhole_lens
 from stages.ingest.cameras.gaps import fill_gaps
 from stages.ingest.cameras.lens import distortion, pinhole_of, stored_view, straightened, undistort

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.keypoints import NAMES, read_keypoints
+from pipeline.clip.records import Split, read_cameras, read_footage, read_split
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import NAMES, read_keypoints
-from pipeline.records import Split, read_cameras, read_footage, read_split
 from stages.ingest.run import run
 from tests.stages.ingest_clips import (
     body_points,

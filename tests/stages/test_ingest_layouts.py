@@ -15,12 +15,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pipeline.camera import Camera, project
+from pipeline.clip.camera import Camera, project
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_footage, read_split
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import RECORD, read_record, with_flat_hands
-from pipeline.records import read_cameras, read_footage, read_split
 from stages.fit.initial_poses import keep_given
 from stages.fit.views import stack
 from stages.ingest.datasets.neuman import official_split

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.clip.frames import read_mask
+from pipeline.clip.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
+from pipeline.clip.records import read_footage, read_split
 from pipeline.errors import UserError
-from pipeline.frames import read_mask
-from pipeline.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
-from pipeline.records import read_footage, read_split
 from stages.ingest.run import run
 from stages.ingest.video import open_clip, read_clip
 from tests.stages.ingest_clips import make_context, write_images

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.detection.estimator import estimator_scale
+from pipeline.clip.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
+from pipeline.detection.mediapipe import estimator_scale
 from pipeline.detection.wholebody import Landmarks, detour, score_faces, score_hands, to_keypoints
 from pipeline.errors import UserError
-from pipeline.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
 from stages.ingest import people
 from stages.ingest.background import learn, take_out
 from stages.ingest.edges import follow_edges

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_footage, read_split
 from pipeline.config.request import parse_request
-from pipeline.job import open_job
-from pipeline.keypoints import read_keypoints
 from pipeline.pose_files import RECORD
-from pipeline.records import read_cameras, read_footage, read_split
+from pipeline.run.job import open_job
 from stages.ingest.datasets.recording import STEP
 from stages.ingest.run import run
 from tests.stages.ingest_clips import make_context

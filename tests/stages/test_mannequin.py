@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from pipeline.body import is_face, joint_index, load_body, load_landmarks, pose_body, rasterize, read_poses
-from pipeline.camera import project, to_camera
-from pipeline.frames import read_frame, read_mask
-from pipeline.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
-from pipeline.records import read_cameras, read_footage, read_split
+from pipeline.clip.camera import project, to_camera
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
+from pipeline.clip.records import read_cameras, read_footage, read_split
 from stages.ingest.mannequin import FRAMINGS, MannequinSpec
 from stages.ingest.mannequin.footage import Filming, film_view, make_mannequin
 from stages.ingest.mannequin.framing import unseen_camera

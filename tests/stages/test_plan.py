@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.camera import facing_camera
-from pipeline.clip import read_fitted_clip
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.fitted_clip import read_fitted_clip
+from pipeline.clip.keypoints import FACE, empty_keypoints, write_keypoints
+from pipeline.clip.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
+from pipeline.clip.records import Split, read_footage, write_footage, write_split
+from pipeline.config.settings import command_line_layer, resolve
 from pipeline.errors import UserError
-from pipeline.json_files import write_json
-from pipeline.keypoints import FACE, empty_keypoints, write_keypoints
-from pipeline.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
-from pipeline.records import Split, read_footage, write_footage, write_split
-from pipeline.settings import command_line_layer, resolve
-from pipeline.tables import write_table
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import write_table
 from stages.ingest.cameras.motion import MOVING
 from stages.plan import decide, measure
 from stages.plan.run import run

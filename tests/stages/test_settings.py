@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from pipeline.config.settings import Layer, read_fields, resolve, schemas
 from pipeline.errors import UserError
-from pipeline.settings import Layer, read_fields, resolve, schemas
-from pipeline.stage import load_stages
+from pipeline.run.stage import load_stages
 
 KINDS = {name: stage.settings for name, stage in load_stages().items()}
 FIELDS = [(stage, field) for stage, kind in KINDS.items() for field in schemas(kind)]

@@ -5,22 +5,20 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline import curves
 from pipeline.avatar import load_avatar
 from pipeline.body import Poses, load_body, read_poses, write_poses
 from pipeline.body import poses as poses_module
-from pipeline.clip import read_fitted_clip
+from pipeline.clip import curves
+from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
-from pipeline.plan import read_plan
+from pipeline.files.tables import read_table
 from pipeline.splat import render
-from pipeline.tables import read_table
-from stages.train import losses, objective
 from stages.train import run as stage
-from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
+from stages.train.held_out import held_out_psnr
 from stages.train.loop import Trainer
-from stages.train.visibility_gate import SCHEMA, VisibilityGate
-from tests.stages.train_subject import BODY_FILE, context_for, write_subject
+from stages.train.visibility_gate import SCHEMA
+from tests.stages.train_subject import BODY_FILE, change_loss, context_for, trainer_for, write_subject
 
 PUBLISHED = {
     "avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet",
@@ -41,15 +39,6 @@ def finished(subject):
     context = context_for(subject, subject / "finished")
     stage.run(context)
     return context.output
-
-
-def trainer_for(context) -> Trainer:
-    data = stage.read_training_data(context)
-    settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
-    refinement = stage.PoseRefinement(data.clip.poses, data.clip.split.train)
-    avatar, data = stage.prepare(data, refinement, settings, context)
-    gate = VisibilityGate(avatar, len(data.clip.body.v_template), settings) if settings.gate else None
-    return Trainer(avatar, refinement, data, settings, gate=gate)
 
 
 def bytes_of(folder) -> dict[str, bytes]:
@@ -147,12 +136,12 @@ def test_training_comes_closer_to_the_training_frames(subject, tmp_path):
     )
     trainer = trainer_for(context)
     frames = trainer.data.clip.split.train
-    before = trainer.held_out(frames)
+    before = held_out_psnr(trainer, frames)
     assert trainer.level == 0
     while trainer.iteration < 15:
         trainer.step()
     assert trainer.level == 1
-    assert trainer.held_out(frames) > before + 3
+    assert held_out_psnr(trainer, frames) > before + 3
 
 
 def test_initial_colors_are_near_the_truth(subject, tmp_path):
@@ -160,7 +149,7 @@ def test_initial_colors_are_near_the_truth(subject, tmp_path):
     trainer = trainer_for(context)
     grey = trainer_for(context_for(subject, tmp_path / "grey", initial_color=False))
     frames = trainer.data.clip.split.test
-    assert trainer.held_out(frames) > grey.held_out(frames) + 5
+    assert held_out_psnr(trainer, frames) > held_out_psnr(grey, frames) + 5
 
 
 def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
@@ -228,11 +217,11 @@ def test_term_that_is_not_finite_stops_with_its_name_and_iteration(subject, tmp_
     context = context_for(subject, tmp_path / "out", iterations=3)
     calls = []
 
-    def poisoned(image, target):
+    def poisoned(loss, operands):
         calls.append(1)
-        return losses.l1(image, target) * (float("nan") if len(calls) == 3 else 1)
+        return loss(*operands) * (float("nan") if len(calls) == 3 else 1)
 
-    monkeypatch.setattr(objective, "ssim_loss", poisoned)
+    change_loss(monkeypatch, "ssim", poisoned)
     with pytest.raises(UserError, match="loss term 'ssim' is nan at iteration 2"):
         stage.run(context)
     assert not list(context.output.iterdir())

@@ -1,7 +1,6 @@
 """A damaged checkpoint is never gone on from: it is begun anew instead, and says so."""
 
 import random
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -49,11 +48,11 @@ def test_a_flipped_bit_anywhere_makes_it_no_checkpoint(written):
 def test_what_is_no_checkpoint_is_said_and_training_begins_anew(tmp_path, content):
     (tmp_path / NAME).write_bytes(content)
     said = []
-    resume(None, tmp_path, "run", SimpleNamespace(log=said.append))
+    resume(None, tmp_path, "run", said.append)
     assert len(said) == 1 and "damaged" in said[0] and "begins anew" in said[0]
 
 
 def test_a_first_run_says_nothing(tmp_path):
     said = []
-    resume(None, tmp_path, "run", SimpleNamespace(log=said.append))
+    resume(None, tmp_path, "run", said.append)
     assert said == []

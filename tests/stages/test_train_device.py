@@ -5,16 +5,18 @@ import importlib
 import pytest
 import torch
 
-from pipeline import curves
-from pipeline.avatar import heads, load_avatar, posing
+from pipeline.avatar import head as heads
+from pipeline.avatar import load_avatar
+from pipeline.avatar import skinning_tables as posing
 from pipeline.body import Pose, load_body
+from pipeline.clip import curves
 from pipeline.device import moved
+from pipeline.files.tables import read_table
 from pipeline.splat import render
-from pipeline.tables import read_table
-from stages.train import initial_colors, loop, objective, visibility_gate
+from stages.train import held_out, initial_colors, loop, objective
 from stages.train import run as stage
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
-from tests.stages.train_subject import BODY_FILE, context_for, write_subject
+from tests.stages.train_subject import BODY_FILE, context_for, data_for, write_subject
 
 ALL_ON = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
@@ -23,7 +25,7 @@ ALL_ON = {
     "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, loop, initial_colors)
+RENDERERS = (objective, held_out, initial_colors)
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +43,13 @@ def without_kernels(monkeypatch):
 def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
     """The loss terms of some steps, and the gradients of the last one."""
     context = context_for(subject, output, **ALL_ON)
-    data = stage.read_training_data(context)
-    refinement = stage.PoseRefinement(data.poses, data.clip.split.train)
-    avatar, data = stage.prepare(data, refinement, context.settings, context)
+    trainer = stage.build_trainer(data_for(context), context.settings)
+    avatar = trainer.avatar
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters():  # no head is silent
         parameter.data += 0.02 * torch.randn(parameter.shape, generator=generator)
-    scored = visibility_gate.VisibilityGate(avatar, len(data.clip.body.v_template), context.settings)
-    trainer = stage.Trainer(avatar, refinement, data, context.settings, gate=scored)
     values = [trainer.step() for _ in range(count)]
-    named = {**dict(avatar.named_parameters()), **dict(refinement.named_parameters())}
+    named = {**dict(avatar.named_parameters()), **dict(trainer.poses.named_parameters())}
     return values, {name: one.grad for name, one in named.items() if one.grad is not None}
 
 

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from pipeline.body import Poses, read_poses, write_poses
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.records import read_cameras, write_cameras
 from pipeline.errors import UserError
-from pipeline.frames import write_frame, write_mask
-from pipeline.json_files import write_json
-from pipeline.records import read_cameras, write_cameras
-from pipeline.tables import read_table
+from pipeline.files.json_files import write_json
+from pipeline.files.tables import read_table
 from stages.train import run as stage
 from stages.train.generated import GeneratedFrames, read_generated
 from stages.train.visibility_gate import SCHEMA
-from tests.stages.train_subject import context_for, write_subject
+from tests.stages.train_subject import context_for, data_for, write_subject
 
 FIRST = 100_000
 
@@ -63,14 +63,11 @@ def inputs_of(subject, output, **changes):
 
 def objective_of(subject, output, **changes):
     context = inputs_of(subject, output, **changes)
-    data = stage.read_training_data(context)
-    refinement = stage.PoseRefinement(data.poses, data.clip.split.train)
-    avatar, data = stage.prepare(data, refinement, context.settings, context)
-    return stage.Trainer(avatar, refinement, data, context.settings, None, None).objective
+    return stage.build_trainer(data_for(context), context.settings).objective
 
 
 def test_frames_have_their_own_size_camera_and_trust(subject, tmp_path):
-    data = stage.read_training_data(inputs_of(subject, tmp_path / "out"))
+    data = data_for(inputs_of(subject, tmp_path / "out"))
     view = data.view(FIRST)
     assert view.generated and view.color.shape == (48, 36, 3) and view.camera.width == 36
     assert view.trust is not None and bool((view.trust == 1).all())

@@ -8,18 +8,17 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose, load_body
-from pipeline.plan import Decision, Plan
-from pipeline.records import read_json
-from pipeline.tables import read_table
+from pipeline.clip.plan import Decision, Plan
+from pipeline.clip.records import read_json
+from pipeline.files.tables import read_table
 from stages.train import run as stage
-from stages.train.apply_plan import apply_plan
 from stages.train.checkpoint import NAME
 from stages.train.loop import Trainer
-from stages.train.regularisers import Regularisers
-from stages.train.visibility_gate import SCHEMA, VisibilityGate
+from stages.train.settings import apply_plan
+from stages.train.visibility_gate import SCHEMA, VisibilityGate, ever_in_frame
 from tests.plans import plan_of
-from tests.stages.test_train import Killed, bytes_of, trainer_for
-from tests.stages.train_subject import BODY_FILE, TINY, context_for, write_subject
+from tests.stages.test_train import Killed, bytes_of
+from tests.stages.train_subject import BODY_FILE, TINY, context_for, data_for, trainer_for, write_subject
 
 LATE = {"early_gate": False, "gate_from": 0.25, "gate_every": 2, "iterations": 12}
 
@@ -39,31 +38,29 @@ def trainer(subject, tmp_path):
 def truth(subject, tmp_path) -> torch.Tensor:
     """Which body vertices the five training frames have in their picture, [5, V]."""
     context = context_for(subject, tmp_path / "truth")
-    data = stage.read_training_data(context)
+    data = data_for(context)
     train = data.clip.split.train
     body = trainer_for(context_for(subject, tmp_path / "whole", gate=False))
-    return torch.stack(
-        [stage.ever_in_frame(body.avatar, body.poses, data.crops, (frame,)) for frame in train]
-    )
+    return torch.stack([ever_in_frame(body.avatar, body.poses, data.crops, (frame,)) for frame in train])
 
 
 def test_scores_over_epochs_are_those_of_the_frames(subject, tmp_path, trainer):
     expected = truth(subject, tmp_path).float().mean(0)
     for _ in range(10):  # two epochs of five frames
         trainer.step()
-    captured, generated = trainer.gate.scores()
+    captured, generated = trainer.hooks["gate"].scores()
     # Refined poses move a vertex across the border now and then.
     assert (captured - expected).abs().max() <= 0.2 and (captured != expected).float().mean() < 0.02
-    assert trainer.gate.drawn.tolist() == [10, 0] and not generated.any()
+    assert trainer.hooks["gate"].drawn.tolist() == [10, 0] and not generated.any()
 
 
 def test_warm_up_ends_when_it_should_and_what_is_gated_is_gone(trainer):
     body = len(trainer.avatar.kept)
     for _ in range(2):
         trainer.step()
-    assert trainer.gate.threshold is None and len(trainer.avatar) == body
+    assert trainer.hooks["gate"].threshold is None and len(trainer.avatar) == body
     trainer.step()
-    assert trainer.gate.threshold.closed and len(trainer.avatar) < 0.6 * body
+    assert trainer.hooks["gate"].threshold.closed and len(trainer.avatar) < 0.6 * body
     decoded = trainer.avatar.decode(0)
     assert len(decoded.offset) == len(trainer.avatar) == int(trainer.avatar.active.sum())
     values = trainer.step()
@@ -81,7 +78,7 @@ def test_gated_gaussians_send_the_triplane_no_gradient(trainer):
     only_gated = read[0] & ~read[1]
     assert only_gated.sum() > 50 and float(mass[only_gated].sum()) == 0 < float(mass[read[1]].sum())
     trainer.avatar.gate(torch.ones_like(trainer.avatar.active))
-    trainer.gate = None
+    del trainer.hooks["gate"]
     trainer.step()
     assert float(trainer.avatar.triplane.planes.grad.abs().sum(-1).flatten()[only_gated].sum()) > 0
 
@@ -102,12 +99,11 @@ def test_laplacians_know_active_neighbours_only(trainer):
         near = [one for one in others if one != row]
         assert float(means[row]) == pytest.approx(float(values[near].mean()))
     assert float(means[place]) == float(values[place])  # nobody is left beside it
-    terms = Regularisers(TINY).static(trainer.avatar.decode(0))
-    assert all(torch.isfinite(term) for term in terms.values())
+    assert all(bool(torch.isfinite(term)) for term in trainer.objective(0, 0, False).values())
 
 
 def test_what_comes_into_view_later_returns(trainer):
-    gate = trainer.gate
+    gate = trainer.hooks["gate"]
     hand = torch.zeros(len(trainer.avatar.kept), dtype=torch.bool)
     hand[trainer.avatar.surfaces[0].canonical.is_part("left_hand")] = True
     gate.drawn[0] = 10
@@ -122,7 +118,7 @@ def test_what_comes_into_view_later_returns(trainer):
 
 
 def test_generated_frames_are_counted_apart_and_keep_what_they_show(trainer):
-    gate, avatar = trainer.gate, trainer.avatar
+    gate, avatar = trainer.hooks["gate"], trainer.avatar
     face, leg = (avatar.surfaces[0].canonical.is_part(part) for part in ("face", "left_leg"))
     gate.drawn[:] = 4
     gate.hits[0], gate.hits[1] = 4 * face, 4 * leg
@@ -134,19 +130,23 @@ def test_generated_frames_are_counted_apart_and_keep_what_they_show(trainer):
 
 
 def test_full_body_in_view_keeps_the_gate_open(trainer):
-    trainer.gate.drawn[0] = 20
-    trainer.gate.hits[0] = torch.randint(15, 21, trainer.gate.hits[0].shape)
-    trainer.gate.update()
-    assert not trainer.gate.threshold.closed and bool(trainer.avatar.active.all())
+    trainer.hooks["gate"].drawn[0] = 20
+    trainer.hooks["gate"].hits[0] = torch.randint(15, 21, trainer.hooks["gate"].hits[0].shape)
+    trainer.hooks["gate"].update()
+    assert not trainer.hooks["gate"].threshold.closed and bool(trainer.avatar.active.all())
 
 
 def test_one_training_frame_is_enough_for_a_threshold(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "out", **LATE))
-    trainer.evidence = dataclasses.replace(trainer.evidence, frames=(2,))
-    trainer.objective.evidence = trainer.evidence
+    split = dataclasses.replace(trainer.data.clip.split, train=(2,))
+    clip = dataclasses.replace(trainer.data.clip, split=split)
+    trainer.objective.data = dataclasses.replace(trainer.data, clip=clip)
     for _ in range(4):
         trainer.step()
-    assert set(trainer.gate.scores()[0].unique().tolist()) == {0.0, 1.0} and trainer.gate.threshold.closed
+    assert (
+        set(trainer.hooks["gate"].scores()[0].unique().tolist()) == {0.0, 1.0}
+        and trainer.hooks["gate"].threshold.closed
+    )
 
 
 @pytest.mark.parametrize("looks", [{}, {"gate_every": 100}], ids=["a look after it", "none after it"])
@@ -236,4 +236,4 @@ def test_without_pose_heads_there_are_none(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "out", pose_heads_from=1.0))
     assert not [name for name, _ in trainer.avatar.named_parameters() if name.startswith("pose_")]
     trainer.step()
-    assert isinstance(trainer.gate, VisibilityGate) and not trainer.avatar.pose_heads_active
+    assert isinstance(trainer.hooks["gate"], VisibilityGate) and not trainer.avatar.pose_heads_active

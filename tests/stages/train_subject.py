@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,12 +13,16 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
-from pipeline.camera import facing_camera
-from pipeline.frames import write_frame, write_mask
-from pipeline.plan import write_plan
-from pipeline.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.plan import read_plan, write_plan
+from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
 from pipeline.splat import render
-from stages.train.settings import TrainSettings
+from stages.train import objective
+from stages.train.data import TrainingData, read_training_data
+from stages.train.loop import Trainer
+from stages.train.run import build_trainer
+from stages.train.settings import TrainSettings, apply_plan
 from tests.plans import plan_of
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
@@ -94,8 +99,8 @@ def context_for(folder: Path, output: Path, work: Path | None = None, **changes)
     work.mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
-    def progress(total: int, label: str):
-        yield SimpleNamespace(advance=lambda n=1, note="": None)
+    def progress(total: int, label: str, costs=None):
+        yield SimpleNamespace(advance=lambda n=1, note="": None, skip=lambda n: None)
 
     return SimpleNamespace(
         settings=dataclasses.replace(TINY, **changes),
@@ -107,3 +112,28 @@ def context_for(folder: Path, output: Path, work: Path | None = None, **changes)
         log=lambda message: None,
         timing=lambda name, value: None,
     )
+
+
+def data_for(context) -> TrainingData:
+    """What the stage reads under a context."""
+    inputs, margin = context.inputs, context.settings.crop_margin
+    return read_training_data(
+        inputs["ingest"], inputs["fit"], inputs.get("auxiliary"), context.body_file, margin
+    )
+
+
+def trainer_for(context) -> Trainer:
+    """A trainer as the stage builds it under a context; hooks that write files are not among its hooks."""
+    settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
+    return build_trainer(data_for(context), settings)
+
+
+def change_loss(monkeypatch, name: str, change: Callable[[Callable, tuple], torch.Tensor]) -> None:
+    """Puts ``change(loss, operands)`` in the place of a frame term's loss."""
+
+    def changed(term):
+        if term.name != name:
+            return term
+        return dataclasses.replace(term, loss=lambda *operands: change(term.loss, operands))
+
+    monkeypatch.setattr(objective, "FRAME_TERMS", tuple(changed(term) for term in objective.FRAME_TERMS))

@@ -8,10 +8,10 @@ import roma
 import torch
 
 from pipeline.body import JOINT_NAMES, Poses, joint_index, rest_joints, write_identity, write_poses
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.clip.records import Footage, write_cameras, write_footage
 from pipeline.motion.read import Wearer
 from pipeline.pose_files import into_camera, read_hand_mean
-from pipeline.records import Footage, write_cameras, write_footage
 
 FPS = 30.0
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.splat import Gaussians, Rendering, render
 
 NAMES = ("means", "quaternions", "scales", "colors", "opacities", "rotation", "translation")

@@ -11,10 +11,10 @@ from safetensors.torch import save_file
 from pipeline.avatar import Architecture, Avatar, build_canonical, load_avatar, pose_features, save_avatar
 from pipeline.avatar.canonical import dilate, tangent_frames, tangent_spacing
 from pipeline.body import Identity, Pose, load_body, mean_identity, posed_vertices, vertex_normals
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.splat import render
-from pipeline.workspace import REPOSITORY
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=8, groups=2, subdivisions=1)
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import nn
 
-from pipeline.avatar.fused_kernels import CHUNKS, bits, lanes_of, norm_relu, norm_relu_backward
-from pipeline.avatar.heads import GroupNormReLU, Head
+from pipeline.avatar.head import GroupNormReLU, Head
+from pipeline.avatar.head_kernels import CHUNKS, bits, lanes_of, norm_relu, norm_relu_backward
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.residual import PLACES, REST, encode, part_rows
 from pipeline.body import Pose, load_body, mean_identity
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 SMALL = Architecture(
     plane_resolution=8,

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline.avatar.rows import put, take
+from pipeline.avatar.row_selection import put, take
 from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.regularisers import unmixed
 from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, body, one_thread  # noqa: F401

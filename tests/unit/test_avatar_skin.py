@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
-from pipeline.avatar.skin import OWN, nearest_rows
+from pipeline.avatar.nearest_skinning import OWN, nearest_rows
 from pipeline.body import Pose, load_body, mean_identity
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 POSE = torch.zeros(55, 3)
 POSE[16, 2], POSE[18, 1] = -1.0, -0.7  # the left arm down and bent

@@ -8,15 +8,15 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import bake
-from pipeline.avatar.fused import Layers, decode
-from pipeline.avatar.heads import Head
-from pipeline.avatar.posing import faces_of_vertices, joints_of_points, normals_of_vertices
+from pipeline.avatar.fused_head import Layers, decode
+from pipeline.avatar.head import Head
+from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points, normals_of_vertices
 from pipeline.body import Pose, load_body, mean_identity, vertex_normals
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
+from pipeline.config.workspace import REPOSITORY
 from pipeline.numba_kernels import threads
 from pipeline.splat import render
-from pipeline.workspace import REPOSITORY
-from stages.evaluate.rendering import animator
+from stages.evaluate.methods import baked_animation
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=16, groups=2, subdivisions=1)
 WITH_RESIDUALS = dataclasses.replace(SMALL, residual_parts=("face", "left_hand", "rest"), residual_width=8)
@@ -152,5 +152,5 @@ def test_evaluate_animates_the_baked_avatar_as_it_would_the_avatar(body):
     avatar = an_avatar(body, WITH_RESIDUALS)
     with torch.no_grad():
         expected = avatar.gaussians(a_pose(), 1.3).tensors()
-    for mine, theirs in zip(animator(avatar)(a_pose(), 1.3).tensors(), expected, strict=True):
+    for mine, theirs in zip(baked_animation(avatar)(a_pose(), 1.3).tensors(), expected, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)

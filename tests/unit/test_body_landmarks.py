@@ -16,8 +16,8 @@ from pipeline.body import (
 )
 from pipeline.body.landmarks import SIZES, join, landmarks_file
 from pipeline.body.parts import PARTS
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.workspace import REPOSITORY
 from tests.unit.fake_body import write_official
 
 FOLDER = REPOSITORY / "data/body"

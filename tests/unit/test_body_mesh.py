@@ -6,8 +6,8 @@ import torch
 import trimesh
 
 from pipeline.body import draw_mesh, edges, load_body, rasterize, subdivide, uniform_laplacian, vertex_normals
-from pipeline.camera import facing_camera, project
-from pipeline.workspace import REPOSITORY
+from pipeline.clip.camera import facing_camera, project
+from pipeline.config.workspace import REPOSITORY
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from pipeline.body import JOINT_NAMES, load_body
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.workspace import REPOSITORY
 from tests.unit.fake_body import PARENTS, VERTICES, Trap, official_arrays, write_official
 
 OPEN_BODY = REPOSITORY / "data/body/open_body.npz"

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.body import PARTS, is_face, is_part, load_body, part_labels
 from pipeline.body.parts import joint_parts
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from pipeline.body import (
     rest_joints,
     rest_vertices,
 )
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 from tests.unit.fake_body import write_official
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.boxes import SMALLEST, Box, clip_box, person_box
+from pipeline.clip.boxes import SMALLEST, Box, clip_box, person_box
+from pipeline.clip.frames import write_mask
+from pipeline.clip.spread import spread_end_to_end, spread_from_start
 from pipeline.errors import UserError
-from pipeline.frames import write_mask
 from pipeline.metrics.ssim import WINDOW
-from pipeline.spread import spread_end_to_end, spread_from_start
 
 
 def test_a_box_by_hand():

@@ -4,7 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from pipeline.compiling import CompileTimer, compile_timer
+from pipeline.run.compile_timer import CompileTimer, compile_timer
 from pipeline.studies.variants import cpu_seconds
 from stages.train.timer import TrainingTimer
 
@@ -47,7 +47,7 @@ def test_a_study_does_not_charge_its_first_run_for_compiling():
 
 def test_the_training_timer_leaves_out_what_was_compiled(tmp_path):
     compiled = CompileTimer()
-    timer = TrainingTimer(tmp_path, 0, compiled)
+    timer = TrainingTimer(tmp_path, compiled)
     compiled.seconds, compiled.cpu_seconds = 50.0, 40.0  # on the way
     assert timer.now(1)[1:] == pytest.approx((-50, -40), abs=5)
     with timer.paused():

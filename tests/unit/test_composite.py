@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.composite import composite, composite_frame, cut_out, over
-from pipeline.metrics.protocol import person
+from pipeline.clip.composite import composite, composite_frame, cut_out, over
+from pipeline.metrics.person_pixels import person
 
 
 def test_over_by_hand():

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Architecture, Avatar, heads
-from pipeline.avatar.heads import Head
-from pipeline.avatar.posing import plain_normals, plain_place
+from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar import head as heads
+from pipeline.avatar.head import Head
+from pipeline.avatar.skinning_tables import plain_normals, plain_place
 from pipeline.body import Pose, joint_transforms, load_body, mean_identity
 from pipeline.device import moved, resolve
 from pipeline.errors import UserError

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.body import joint_index, posed_joints
-from pipeline.camera import facing_camera
+from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.pose_files import read_hand_mean, read_initial_poses
 from pipeline.pose_files.axes import into_camera, into_world, moved_pivot

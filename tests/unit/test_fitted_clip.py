@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from pipeline.body import load_body, posed_vertices, read_poses, write_poses
-from pipeline.boxes import Box
-from pipeline.clip import ViewCache, read_fitted_clip
+from pipeline.clip.boxes import Box
+from pipeline.clip.fitted_clip import read_fitted_clip
+from pipeline.clip.frames import read_frame, read_mask, write_mask
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
+from pipeline.clip.records import Split, read_cameras, read_footage, write_cameras, write_footage, write_split
+from pipeline.clip.views import ViewCache
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_mask
-from pipeline.keypoints import empty_keypoints, write_keypoints
-from pipeline.records import Split, read_cameras, read_footage, write_cameras, write_footage, write_split
 from tests.stages.train_subject import BODY_FILE, FRAMES, HEIGHT, WIDTH, moving_poses, write_subject
 
 BOX = Box(left=5, top=7, right=41, bottom=60)

@@ -11,9 +11,9 @@ import av
 import numpy as np
 import pytest
 
+from pipeline.clip.frames import frame_path, read_frame, read_mask, write_frame, write_mask, write_video
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.frames import frame_path, read_frame, read_mask, write_frame, write_mask, write_video
-from pipeline.workspace import REPOSITORY
 
 
 def noise(*shape: int) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_equal_images_give_equal_video(tmp_path: Path) -> None:
 ENCODE = """
 import hashlib, sys
 import numpy as np
-from pipeline.frames import write_video
+from pipeline.clip.frames import write_video
 rows, columns = np.mgrid[:50, :38] / 50
 for turn in range(3):
     images = []

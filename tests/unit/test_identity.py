@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.metrics.identity import FaceReader, identity_cosine, identity_distance, typical
+from pipeline.metrics.face_identity import FaceReader, identity_cosine, identity_distance, typical
 
 
 def test_distance_and_cosine():

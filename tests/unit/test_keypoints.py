@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline import keypoints as kp
+from pipeline.clip import keypoints as kp
 from pipeline.errors import UserError
 
 

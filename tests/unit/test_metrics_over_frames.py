@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.boxes import Box
+from pipeline.clip.boxes import Box
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.config.choices import ProtocolName
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.config.evaluation_protocol import PROTOCOLS, Protocol, chosen
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.intervals import block_length, interval, stretch
 from pipeline.metrics.regions import region_boxes
-from pipeline.protocols import PROTOCOLS, Protocol, chosen
 
 # Intervals
 

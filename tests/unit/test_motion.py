@@ -17,15 +17,15 @@ from pipeline.body import (
     posed_joints,
     rest_joints,
 )
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.motion.fitted import READ
+from pipeline.motion.fitted_motion import READ
 from pipeline.motion.legs import leg_of
-from pipeline.motion.names import motion_name
-from pipeline.motion.place import place
+from pipeline.motion.motion import Motion, Span
+from pipeline.motion.motion_name import motion_name
+from pipeline.motion.placement import place
 from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
-from pipeline.motion.record import Motion, Span
 from pipeline.pose_files import read_hand_mean
-from pipeline.workspace import REPOSITORY
 from stages.animate import LENT
 from tests.unit.motion_files import (
     FPS,

@@ -3,12 +3,12 @@
 import subprocess
 import sys
 
-from pipeline.workspace import REPOSITORY
+from pipeline.config.workspace import REPOSITORY
 
 PROGRAM = """
 import torch
 from pipeline.numba_kernels import threads
-from pipeline.avatar.heads import Head
+from pipeline.avatar.head import Head
 with threads(1):
     Head(4, 2, width=8, groups=2)(torch.ones(4, 4))  # numba's first parallel kernel
     print(torch.get_num_threads())

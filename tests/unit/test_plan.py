@@ -5,8 +5,8 @@ import json
 
 import pytest
 
+from pipeline.clip.plan import EFFECTS, Decision, Plan, read_plan, write_plan
 from pipeline.errors import UserError
-from pipeline.plan import EFFECTS, Decision, Plan, read_plan, write_plan
 
 
 def made_plan(**changes) -> Plan:

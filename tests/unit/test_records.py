@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.camera import Camera, facing_camera
-from pipeline.errors import UserError
-from pipeline.records import (
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.records import (
     Footage,
     Split,
     read_cameras,
@@ -22,6 +21,7 @@ from pipeline.records import (
     write_footage,
     write_split,
 )
+from pipeline.errors import UserError
 
 FOOTAGE = Footage(
     name="clip.mp4", width=1280, height=720, fps=29.97, scale=0.4, read=10, kept=2,

@@ -4,8 +4,7 @@ import pytest
 from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.errors import UserError
-from pipeline.settings import (
+from pipeline.config.settings import (
     SETTINGS,
     Count,
     Iterations,
@@ -17,6 +16,7 @@ from pipeline.settings import (
     resolve,
     setting,
 )  # fmt: skip
+from pipeline.errors import UserError
 
 
 @dataclass(frozen=True, config=SETTINGS)

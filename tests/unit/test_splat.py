@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from pipeline.camera import Camera, facing_camera, project
+from pipeline.clip.camera import Camera, facing_camera, project
 from pipeline.splat import Gaussians, render
 from tests.unit.splat_scene import NAMES, draw, images, leaves, scene
 

@@ -8,7 +8,7 @@ import types
 import pytest
 import torch
 
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
 from pipeline.splat import Gaussians
 from pipeline.splat.dense import alphas, blending_weights, project_gaussians, render_dense

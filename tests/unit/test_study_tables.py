@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.clip.curves import SCHEMA
 from pipeline.config.request import parse_request
-from pipeline.curves import SCHEMA
-from pipeline.settings import read_toml
+from pipeline.config.settings import read_toml
+from pipeline.files.tables import write_table
 from pipeline.studies import ablation
 from pipeline.studies.ablation import (
     CHANCE,
@@ -39,7 +40,6 @@ from pipeline.studies.tradeoff import Tradeoff, plots, point_table, write_tradeo
 from pipeline.studies.tradeoff import headline as pays
 from pipeline.studies.tradeoff import tables_of as points_of
 from pipeline.studies.variants import Result, base_of
-from pipeline.tables import write_table
 
 ROWS = {
     "full": {"psnr": 30.004, "train_s": 10.0, MAIN: True},

@@ -1,17 +1,19 @@
 """What the terms of the objective are built from: crops for LPIPS, the pasted face, weights by part."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from pipeline.avatar import build_canonical
 from pipeline.body import load_body, mean_identity
-from pipeline.camera import facing_camera
-from pipeline.workspace import REPOSITORY
-from stages.train import STAGE, regularisers
-from stages.train.face import Pasted, face_loss, face_triangles, paste
-from stages.train.perceptual import crop, due
+from pipeline.clip.camera import facing_camera
+from pipeline.config.settings import Weight
+from pipeline.config.workspace import REPOSITORY
+from stages.train import STAGE, losses, objective, regularisers
+from stages.train.face import Pasted, face_triangles, paste
+from stages.train.losses import person_crop
 from stages.train.settings import TrainSettings
 
 
@@ -29,7 +31,7 @@ def a_mask() -> torch.Tensor:
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
 def test_crop_shows_the_person_and_stays_in_the_picture(share):
-    rows, columns = crop(a_mask(), 16, share)
+    rows, columns = person_crop(a_mask(), 16, share)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (16, 16)
     assert 0 <= rows.start and rows.stop <= 40 and 0 <= columns.start and columns.stop <= 60
     assert a_mask()[rows, columns].sum() > 0
@@ -38,19 +40,15 @@ def test_crop_shows_the_person_and_stays_in_the_picture(share):
 def test_crops_reach_all_of_the_person():
     covered = torch.zeros(40, 60, dtype=torch.bool)
     for share in torch.linspace(0, 0.999, 200).tolist():
-        covered[crop(a_mask(), 8, share)] = True
+        covered[person_crop(a_mask(), 8, share)] = True
     assert covered[a_mask() > 0.5].all() and not covered[:, 40:].any()
 
 
 def test_crop_that_is_no_crop():
-    assert crop(a_mask(), 0, 0.5) == (slice(0, 40), slice(0, 60))
-    assert crop(a_mask(), 50, 0.5)[0] == slice(0, 40)
-    rows, columns = crop(torch.zeros(40, 60), 16, 0.5)  # nobody
+    assert person_crop(a_mask(), 0, 0.5) == (slice(0, 40), slice(0, 60))
+    assert person_crop(a_mask(), 50, 0.5)[0] == slice(0, 40)
+    rows, columns = person_crop(torch.zeros(40, 60), 16, 0.5)  # nobody
     assert (rows, columns) == (slice(12, 28), slice(22, 38))
-
-
-def test_lpips_looks_at_every_kth_draw():
-    assert [due(position, 3) for position in range(7)] == [True, False, False, True, False, False, True]
 
 
 CAMERA = facing_camera(24, 16, 20.0)
@@ -118,11 +116,16 @@ def test_face_loss_by_hand():
     rows, columns = torch.tensor([0, 1]), torch.tensor([1, 1])
     pasted = Pasted(rows, columns, torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.0, 0.0]]))
     color, alpha = torch.full((2, 3, 3), 0.25), torch.ones(2, 3)
-    assert float(face_loss(pasted, color, alpha)) == pytest.approx((3 * 0.25 + 0.75 + 2 * 0.25) / 18)
+
+    def loss(pasted):
+        term = next(term for term in objective.FRAME_TERMS if term.name == "face")
+        frame = SimpleNamespace(face=pasted, view=SimpleNamespace(color=color, alpha=alpha))
+        return float(losses.weighted_mean(term.loss(*term.of(frame)), term.mask(frame), term.count(frame)))
+
+    assert loss(pasted) == pytest.approx((3 * 0.25 + 0.75 + 2 * 0.25) / 18)
     alpha[1, 1] = 0  # something else stands in front
-    assert float(face_loss(pasted, color, alpha)) == pytest.approx(3 * 0.25 / 18)
-    nobody = Pasted(rows[:0], columns[:0], torch.zeros(0, 3))
-    assert float(face_loss(nobody, color, alpha)) == 0
+    assert loss(pasted) == pytest.approx(3 * 0.25 / 18)
+    assert loss(Pasted(rows[:0], columns[:0], torch.zeros(0, 3))) == 0
 
 
 def test_face_triangles_are_those_of_the_face(canonical):
@@ -133,17 +136,21 @@ def test_face_triangles_are_those_of_the_face(canonical):
 
 def test_weights_follow_the_parts(canonical):
     settings = TrainSettings(offset=1.0, offset_hands=2.0, offset_face=3.0, laplacian_color_hands=4.0)
-    weights = regularisers.part_weights(canonical, settings)
+    terms = {term.name: term for term in objective.TERMS}
+    weights = {
+        name: regularisers.weight_by_part(canonical, *terms[name].part_weights(settings))
+        for name in ("offset", "laplacian_color")
+    }
     hands, face = canonical.is_part("left_hand", "right_hand"), canonical.is_part("face")
-    assert set(weights.offset[hands].flatten().tolist()) == {2.0}
-    assert set(weights.offset[face].flatten().tolist()) == {3.0}
-    assert set(weights.offset[~hands & ~face].flatten().tolist()) == {1.0}
-    assert set(weights.laplacian_color[hands].flatten().tolist()) == {4.0}
-    assert weights.undersides is None
+    assert set(weights["offset"][hands].flatten().tolist()) == {2.0}
+    assert set(weights["offset"][face].flatten().tolist()) == {3.0}
+    assert set(weights["offset"][~hands & ~face].flatten().tolist()) == {1.0}
+    assert set(weights["laplacian_color"][hands].flatten().tolist()) == {4.0}
+    assert regularisers.find_regions(canonical, {}, arms=False).undersides is None
 
 
 def test_undersides_lie_below_what_they_are_paired_with(canonical):
-    found = regularisers.undersides(canonical)
+    found = regularisers.find_undersides(canonical)
     matrix = found.above.matrix.to_dense()
     torch.testing.assert_close(matrix.sum(1), torch.ones(len(found.rows)))
     up = canonical.frames[:, 1, 2]
@@ -159,3 +166,40 @@ def test_undersides_lie_below_what_they_are_paired_with(canonical):
 def test_lpips_is_asked_for_only_where_it_has_a_weight():
     assert STAGE.demands(TrainSettings(lpips=0.0)).assets == ()
     assert STAGE.demands(TrainSettings(lpips=0.2)).assets == ("lpips",)
+
+
+def test_every_weight_of_the_settings_weighs_a_term():
+    named = {name for term in objective.TERMS for name in (*term.weights, term.generated) if name}
+    weights = {field.name for field in dataclasses.fields(TrainSettings) if field.type in ("Weight", Weight)}
+    assert named == weights and len({term.name for term in objective.TERMS}) == len(objective.TERMS)
+
+
+def test_terms_take_part_from_their_iteration_on_and_in_every_kth_draw():
+    settings = TrainSettings(iterations=10, lpips=0.2, lpips_every=3, lpips_from=0.25, pose_heads_from=1.0)
+    terms = {term.name: term for term in objective.TERMS}
+    lpips = terms["lpips"]
+    assert [lpips.takes_part(settings, 3, position, False) for position in range(4)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
+    assert [lpips.takes_part(settings, iteration, 0, False) for iteration in (0, 2, 3)] == [
+        False,
+        False,
+        True,
+    ]
+    assert lpips.scalar_weight(settings, False) == pytest.approx(0.6)
+    assert lpips.scalar_weight(settings, True) == pytest.approx(3 * settings.generated)
+    assert terms["pose_offset"].first_iteration(settings) is None  # 1 stands for never
+    assert terms["hand_normal"].first_iteration(settings) is None  # no weight
+    weighted = TrainSettings(face=0.8)
+    assert [terms["face"].takes_part(weighted, 0, 0, generated) for generated in (False, True)] == [
+        True,
+        False,
+    ]
+
+
+def test_the_log_names_what_takes_part_with_its_weights():
+    line = objective.describe_objective(TrainSettings(iterations=10, l1=0.7, pose_heads_from=0.35, lpips=0.0))
+    assert "l1 0.7, ssim 0.2" in line and "pose_offset 50 from iteration 4" in line and "lpips" not in line

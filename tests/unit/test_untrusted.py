@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.body import read_poses
+from pipeline.clip.keypoints import read_keypoints
+from pipeline.clip.records import read_cameras, read_json
 from pipeline.errors import UserError
-from pipeline.keypoints import read_keypoints
-from pipeline.records import read_cameras, read_json
 from pipeline.untrusted import (
     check_picture,
     inside,

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.camera import facing_camera
-from pipeline.visibility import (
+from pipeline.avatar.visibility import (
     LARGEST_LOSS,
     evidence_threshold,
     fixed_threshold,
@@ -15,6 +14,7 @@ from pipeline.visibility import (
     otsu_threshold,
     share_below,
 )
+from pipeline.clip.camera import facing_camera
 
 RNG = np.random.default_rng(0)
 TWO = np.repeat([0.0, 1.0], [500, 500])

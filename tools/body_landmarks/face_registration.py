@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from body_landmarks.tables import LOWER_LIP, UPPER_LIP, mirror_of
 from pipeline.body import BodyModel, joint_index, rasterize
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 
 _YAWS = (-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.2)  # radians, views from which a face is looked at
 _PITCHES = (0.0, 0.5)  # the second from below

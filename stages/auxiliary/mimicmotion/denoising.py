@@ -17,7 +17,7 @@ from stages.auxiliary.mimicmotion.model import Model, load_model
 from stages.auxiliary.mimicmotion.tiles import tile_weights, tiles
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 FPS, MOTION, NOISE = 6.0, 127.0, 0.0  # what the model is told: frame rate less one, motion, added noise
 CHUNK = 8  # frames that are decoded together

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from pipeline.body import BodyModel, Landmarks
-from pipeline.keypoints import Keypoints
+from pipeline.clip.keypoints import Keypoints
 from pipeline.numba_kernels import threads
 from stages.fit.face.deca import read_flame_parameters
 from stages.fit.face.flame import face_from_flame

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from pipeline.keypoints import Keypoints
+from pipeline.clip.keypoints import Keypoints
 from stages.ingest.cameras.lens import undistort
 from stages.ingest.detect import Detected
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from pipeline.clip.records import read_cameras, read_json
 from pipeline.errors import UserError
-from pipeline.records import read_cameras, read_json
 from stages.ingest.video import Clip
 
 WORDS = ("auto", "pinhole", "sfm")

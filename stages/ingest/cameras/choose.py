@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 import torch
 
-from pipeline.camera import Camera, facing_camera
+from pipeline.clip.camera import Camera, facing_camera
+from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
-from pipeline.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.apply import select
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
@@ -29,7 +29,7 @@ from stages.ingest.detect import Detected
 from stages.ingest.video import Clip
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 GAP_SECONDS = 0.5  # over which a camera is interpolated between two that are known
 

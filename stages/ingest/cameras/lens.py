@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pycolmap
 
+from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
+from pipeline.clip.keypoints import Keypoints
 from pipeline.detection.wholebody import inside
 from pipeline.errors import UserError
-from pipeline.frames import read_frame, read_mask, write_frame, write_mask
-from pipeline.keypoints import Keypoints
 from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
 from stages.ingest.video import Clip
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.frames import read_frame, read_mask
+from pipeline.clip.frames import read_frame, read_mask
 
 GAP_SECONDS = 1.0  # between the frames of a pair, if features can be followed that far
 PAIRS = 24  # looked at, evenly spread over the clip

@@ -16,7 +16,7 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.keypoints import Keypoints
+from pipeline.clip.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 
 TRUNK, HEAD = (11, 12, 23, 24), tuple(range(11))  # of MediaPipe's pose; the trunk turns, but hardly bends

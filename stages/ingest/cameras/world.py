@@ -2,7 +2,7 @@
 
 Y points along the cameras' mean up axis (nobody holds a camera askew for a whole clip), the first camera
 stands at the origin and looks towards -Z: a clip whose camera stands still gets exactly
-:func:`pipeline.camera.facing_camera`.
+:func:`pipeline.clip.camera.facing_camera`.
 """
 
 from __future__ import annotations

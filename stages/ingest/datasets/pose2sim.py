@@ -19,8 +19,8 @@ import tomllib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+from pipeline.config.settings import near
 from pipeline.errors import UserError
-from pipeline.settings import near
 from pipeline.untrusted import bounded_bytes
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.rig import read_qualisys, read_toml_rig

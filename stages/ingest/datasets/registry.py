@@ -6,8 +6,8 @@ import importlib
 from pathlib import Path
 from types import ModuleType
 
+from pipeline.config.settings import near
 from pipeline.errors import UserError
-from pipeline.settings import near
 from stages.ingest.datasets.recording import Recording
 from stages.ingest.layouts import LAYOUTS
 from stages.ingest.settings import IngestSettings

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Landmarks, joint_index, rasterize
-from pipeline.camera import facing_camera, project
+from pipeline.clip.camera import facing_camera, project
 from stages.ingest.mannequin.attire import Fields, Measures, Style, garments, make_style, measure
 from stages.ingest.mannequin.face_paint import Decal, paint_face, paint_print
 

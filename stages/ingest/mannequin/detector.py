@@ -36,8 +36,8 @@ import dataclasses
 import numpy as np
 from scipy.special import expit, ndtr
 
-from pipeline.camera import Camera, project, to_camera
-from pipeline.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, empty_keypoints
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, empty_keypoints
 from stages.ingest.mannequin.framing import inside
 from stages.ingest.mannequin.spec import MannequinSpec
 from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, Places

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from pipeline.body import BodyModel, Landmarks, locate
-from pipeline.keypoints import FACE
+from pipeline.clip.keypoints import FACE
 from stages.ingest.mannequin.attire import Measures, Style
 
 _LEVELS = 6

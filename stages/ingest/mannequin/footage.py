@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.body import BodyModel, Landmarks, rest_joints
-from pipeline.camera import Camera, project
-from pipeline.keypoints import Keypoints
+from pipeline.clip.camera import Camera, project
+from pipeline.clip.keypoints import Keypoints
 from stages.ingest.mannequin.appearance import make_appearance
 from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.detector import detect

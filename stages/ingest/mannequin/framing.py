@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, joint_index, pose_body
-from pipeline.camera import Camera, facing_camera
+from pipeline.clip.camera import Camera, facing_camera
 from stages.ingest.mannequin.motion import Motion
 from stages.ingest.mannequin.spec import VIEWS, MannequinSpec
 

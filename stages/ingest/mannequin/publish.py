@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.body import load_body, load_landmarks
-from pipeline.frames import write_frame, write_mask
-from pipeline.keypoints import write_keypoints
-from pipeline.records import Footage, write_cameras, write_footage, write_split
+from pipeline.clip.frames import write_frame, write_mask
+from pipeline.clip.keypoints import write_keypoints
+from pipeline.clip.records import Footage, write_cameras, write_footage, write_split
 from stages.ingest.mannequin.footage import Filming, film_view
 from stages.ingest.mannequin.scene import Picture
 from stages.ingest.mannequin.spec import MannequinSpec, spec_of
@@ -23,7 +23,7 @@ from stages.ingest.preview import write_preview
 from stages.ingest.split import split_frames
 
 if TYPE_CHECKING:
-    from pipeline.stage import Context
+    from pipeline.run.stage import Context
 
 
 def run_mannequin(context: Context) -> None:

@@ -21,7 +21,7 @@ from pipeline.body import (
     rest_vertices,
     vertex_normals,
 )
-from pipeline.camera import Camera
+from pipeline.clip.camera import Camera
 from stages.ingest.mannequin.appearance import Appearance
 from stages.ingest.mannequin.framing import Shot
 from stages.ingest.mannequin.limbs import limbs_of_vertices

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import SETTINGS, Count, Fraction, FrameRate, Seed, Side
+from pipeline.config.settings import SETTINGS, Count, Fraction, FrameRate, Seed, Side
 
 Framing = Literal["full", "upper", "head"]
 Detector = Literal["mediapipe", "heatmap"]

@@ -39,8 +39,8 @@ from pipeline.body import (
     write_poses,
 )
 from pipeline.body.landmarks import join
-from pipeline.camera import Camera, project, to_camera
-from pipeline.tables import read_table, vectors, write_table
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.files.tables import read_table, vectors, write_table
 from stages.ingest.mannequin.framing import inside
 from stages.ingest.mannequin.limbs import limbs_of_joints
 from stages.ingest.mannequin.scene import Picture

@@ -1,7 +1,7 @@
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import SETTINGS
-from pipeline.stage import Stage
+from pipeline.config.settings import SETTINGS
+from pipeline.run.stage import Stage
 
 
 @dataclass(frozen=True, config=SETTINGS)

@@ -1,7 +1,7 @@
 from pydantic.dataclasses import dataclass
 
-from pipeline.settings import SETTINGS, Fraction, Iterations
-from pipeline.stage import Stage
+from pipeline.config.settings import SETTINGS, Fraction, Iterations
+from pipeline.run.stage import Stage
 
 
 @dataclass(frozen=True, config=SETTINGS)

@@ -1,0 +1,29 @@
+"""JSON files as this project writes them, for people and programs: sorted, indented, finite.
+
+Reading JSON, which may be somebody else's, is ``pipeline.untrusted.parse_json``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.finite import NotFiniteError, not_finite_in
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file.
+
+    Raises:
+        NotFiniteError: a number is not finite; names its place.
+    """
+    place = not_finite_in(value)
+    if place is not None:
+        raise NotFiniteError(f"{path.name}: {place} is not finite")
+    path.write_text(json_text(value), encoding="utf-8")
+
+
+def json_text(value: Any) -> str:
+    """The text of a JSON file; ValueError where a number is not finite."""
+    return json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n"

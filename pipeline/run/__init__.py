@@ -1,0 +1,1 @@
+"""Running stages: declaration, job, process, reporter, cluster."""

@@ -1,0 +1,146 @@
+"""Stages run in processes of their own, and why one failed."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from pipeline.config.request import Request
+from pipeline.errors import UserError
+from pipeline.run.job import Job
+from pipeline.run.stage import usual
+from pipeline.store.artifact import Artifact
+
+REASON = "FLEXIAVATAR_REASON"
+"""Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
+
+_PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
+
+
+def stage_command(stage: str, subject: str, request: Request) -> list[str]:
+    """The command line of one stage."""
+    words = request.about(subject).words()
+    words.pop("subject", None)
+    pairs = [f"{name}={value}" for name, value in words.items()]
+    return [sys.executable, "-m", "pipeline", stage, "--subject", subject, *pairs]
+
+
+def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
+    """Runs a stage in a process that writes to this terminal and ends with this one.
+
+    Args:
+        stage: its name.
+        subject: whose.
+        request: the command line's.
+        log: a file that gets the stage's lines in place of this terminal.
+
+    Returns:
+        Why it failed, in a line; None where it did not.
+    """
+    with tempfile.TemporaryDirectory(prefix="flexiavatar-") as folder:
+        reason = Path(folder) / "reason"
+        environment = {**process_environment(), REASON: str(reason)}
+        command = stage_command(stage, subject, request)
+        prepare = functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
+        with contextlib.ExitStack() as stack:
+            out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
+            status = subprocess.run(
+                command, env=environment, stdout=out, stderr=out, check=False, preexec_fn=prepare
+            ).returncode
+        said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
+    if status < 0:
+        return killed_by(-status)
+    if status:
+        where = "its own lines above say why" if log is None else f"{log} says why"
+        return said or f"stopped with status {status}; {where}"
+    return None
+
+
+def leave_reason(message: str) -> None:
+    """Leaves the reason of a failure where the starter looks for it, if there is one."""
+    if os.environ.get(REASON):
+        with contextlib.suppress(OSError):
+            Path(os.environ[REASON]).write_text(message, encoding="utf-8")
+
+
+def process_environment() -> dict[str, str]:
+    """The environment of a stage's process.
+
+    The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
+    zeroed pages at every step; they must be set before Python starts.
+    """
+    defaults = {
+        "MALLOC_MMAP_THRESHOLD_": "4294967296",
+        "MALLOC_TRIM_THRESHOLD_": "4294967296",
+        "MALLOC_TOP_PAD_": "268435456",
+    }
+    return {**defaults, **os.environ}
+
+
+def killed_by(number: int) -> str:
+    """Why a process ended that a signal ended."""
+    try:
+        name = f" ({signal.Signals(number).name})"
+    except ValueError:
+        name = ""
+    likely = ""
+    if name == " (SIGKILL)":
+        likely = ", often the system's when memory runs out: run fewer subjects at once or a smaller preset"
+    return f"killed by signal {number}{name}{likely}; the same command goes on from here"
+
+
+def _end_with(parent: int) -> None:
+    """Lets the kernel end this process if the one that started it is killed."""
+    with contextlib.suppress(OSError, AttributeError):  # a C library without it
+        ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGTERM)
+        if os.getppid() != parent:  # it was killed before the kernel knew
+            os._exit(1)
+
+
+def make_results(
+    job: Job, stages: Iterable[str] | None = None, log: Path | None = None
+) -> dict[str, Artifact]:
+    """The results of some stages and of all that they need; what the store lacks is run first.
+
+    ``latest`` is left pointing where it pointed before.
+
+    Args:
+        job: whose, and under which settings.
+        stages: names; all that run without being asked for if None.
+        log: a file that gets the stages' own lines in place of this terminal.
+
+    Raises:
+        UserError: a stage stopped.
+    """
+    found = {}
+    with _latest_kept(job):
+        for stage in job.upstream_first(usual(job.stages) if stages is None else stages):
+            if job.find(stage) is None:
+                reason = run_stage_process(stage, job.subject.name, job.request, log)
+                if reason:
+                    raise UserError(f"{stage}:{job.subject.name} {reason}")
+            artifact = job.find(stage)
+            if artifact is None:
+                raise UserError(f"{stage}:{job.subject.name} ran, and its result is not in the store")
+            found[stage] = artifact
+    return found
+
+
+@contextlib.contextmanager
+def _latest_kept(job: Job) -> Iterator[None]:
+    """Puts every stage's ``latest`` back to what it was."""
+    before = {stage: job.store.latest(job.subject.name, stage) for stage in job.stages}
+    try:
+        yield
+    finally:
+        for artifact in before.values():
+            if artifact is not None and artifact.folder.is_dir():
+                job.store.select(artifact)

@@ -1,0 +1,1 @@
+"""The report: tables, plots, pictures and videos of a finished evaluation, in one HTML file."""

@@ -1,0 +1,97 @@
+"""Hooks of the training loop: what happens beside the optimiser's steps, without the loop knowing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.body import Pose
+from pipeline.clip.views import View
+from pipeline.run.progress import Progress
+from stages.train.checkpoint import write_checkpoint
+from stages.train.timer import TrainingTimer
+
+if TYPE_CHECKING:
+    from stages.train.loop import Trainer
+
+Log = Callable[[str], None]
+"""Writes one line to the terminal."""
+
+
+class Hook:
+    """A hook that does nothing; each of its methods is called by the trainer.
+
+    A checkpoint holds the parameters and buffers of a hook that is a ``torch.nn.Module``, and ``json_state``.
+    """
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Called before the first step of a process, after a checkpoint was restored."""
+
+    def on_frame(self, pose: Pose, view: View) -> None:
+        """Called with the pose in which a frame was rendered, and the frame."""
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Called after each step with the weighted loss terms; ``trainer.iteration`` counts the step."""
+
+    def json_state(self) -> dict[str, Any]:
+        """JSON values for a checkpoint."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Takes back what ``json_state`` gave; an empty dict leaves everything as it is."""
+
+
+class NearestSkinning(Hook):
+    """Gives Gaussians the skinning weights of the vertices that they have come to lie at, now and then."""
+
+    def __init__(self, every: int):
+        """A hook for every so many iterations."""
+        self._every = every
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Looks for the nearest vertices where it is time."""
+        if trainer.iteration % self._every == 0:
+            trainer.avatar.reskin()
+
+
+class Checkpoints(Hook):
+    """Writes a checkpoint now and then, but for the last iteration."""
+
+    def __init__(self, work: Path, key: str, every: int, timer: TrainingTimer):
+        """A hook that has written nothing.
+
+        Args:
+            work: the folder for checkpoints.
+            key: of the run.
+            every: iterations between two.
+            timer: its marks are saved beside each.
+        """
+        self._work, self._key, self._every, self._timer = work, key, every, timer
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Writes one where it is time."""
+        if trainer.iteration < trainer.settings.iterations and trainer.iteration % self._every == 0:
+            write_checkpoint(self._work, trainer.checkpoint(self._key))
+            self._timer.save(trainer.iteration)
+
+
+class ProgressBar(Hook):
+    """Moves a progress bar on, with the loss beside it."""
+
+    def __init__(self, progress: Progress):
+        """A hook on a bar that counts iterations."""
+        self._progress = progress
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Skips the iterations of a killed run."""
+        self._progress.skip(trainer.iteration)
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Counts the step."""
+        self._progress.advance(1, describe(terms))
+
+
+def describe(terms: dict[str, float]) -> str:
+    """The objective's value in words."""
+    return f"loss {sum(terms.values()):.4f}"

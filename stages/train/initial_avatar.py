@@ -1,0 +1,98 @@
+"""The avatar before training: the vertices that get a Gaussian, and their colours."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar.canonical import dilate
+from pipeline.clip.spread import spread_from_start
+from pipeline.errors import UserError
+from stages.train.data import TrainingData
+from stages.train.initial_colors import initial_color_logits
+from stages.train.poses import PoseRefinement
+from stages.train.settings import TrainSettings
+from stages.train.visibility_gate import ever_in_frame
+
+
+def initial_avatar(
+    data: TrainingData,
+    refinement: PoseRefinement,
+    settings: TrainSettings,
+    log: Callable[[str], None] = lambda line: None,
+) -> tuple[Avatar, TrainingData]:
+    """The untrained avatar in its initial colours, on the device of the poses.
+
+    Args:
+        data: what it will be learnt from.
+        refinement: the fitted poses.
+        settings: with the plan applied.
+        log: for a line with the numbers of vertices and Gaussians.
+
+    Returns:
+        The avatar, and the data with the texture of the face loss where that has a weight.
+
+    Raises:
+        UserError: no training frame has any of the body in its picture.
+    """
+    kept = kept_vertices(data, refinement, settings)
+    # What is shown in its base colours in the end belongs to the avatar, though it is never trained.
+    rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
+    clip, sizes = data.clip, architecture(settings)
+    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, settings.half_precision)
+    avatar.to(refinement.poses.rotation.device)
+    avatar.pose_heads_active = avatar.residuals_active = False
+    set_time_range(avatar, data)
+    if settings.initial_color or settings.face:
+        captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
+        logits = initial_color_logits(avatar.eval(), refinement, data, captured, made)
+        if settings.face:
+            data = dataclasses.replace(data, texture=torch.sigmoid(logits))
+        if settings.initial_color:
+            avatar.base_color.copy_(logits)
+    avatar.gate(kept[rows].to(avatar.device))
+    parts = ", ".join(region.part for region in avatar.surface().residual) or "no part"
+    log(
+        f"{int(kept.sum())} of {len(kept)} body vertices are kept, {len(avatar)} Gaussians; "
+        f"residual colours of: {parts}"
+    )
+    return avatar.train(), data
+
+
+def kept_vertices(data: TrainingData, refinement: PoseRefinement, settings: TrainSettings) -> Tensor:
+    """The body vertices that get a Gaussian to begin with, [V] bool on the CPU.
+
+    Raises:
+        UserError: no training frame has any of the body in its picture.
+    """
+    clip = data.clip
+    everything = torch.arange(len(clip.body.v_template))
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    body = Avatar(clip.body, clip.identity, everything, bare).to(refinement.poses.rotation.device)
+    seen = ever_in_frame(body, refinement, data.crops, clip.split.train)
+    if not bool(seen.any()):
+        raise UserError("the fitted body is outside every frame; run fit again")
+    if not (settings.gate and settings.early_gate):
+        return torch.ones(len(seen), dtype=torch.bool)
+    # The rings are what offsets and refined poses may bring in.
+    return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
+
+
+def set_time_range(avatar: Avatar, data: TrainingData) -> None:
+    """Tells the avatar's residual heads when the training frames were filmed."""
+    seconds = data.clip.seconds
+    times = [seconds[frame] for frame in data.clip.split.train if frame in seconds]
+    if times:
+        avatar.residuals.time_range.copy_(torch.tensor([min(times), max(times)]))
+
+
+def architecture(settings: TrainSettings) -> Architecture:
+    """The part of the settings that an avatar's file has to remember."""
+    names = [field.name for field in dataclasses.fields(Architecture) if field.name != "pose_heads"]
+    remembered = {name: getattr(settings, name) for name in names}
+    remembered["residual_parts"] = () if settings.residual_from == 1 else settings.residual_parts
+    return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)

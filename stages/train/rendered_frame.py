@@ -1,0 +1,128 @@
+"""The operands of the losses: the static avatar, and one drawn frame beside its rendering."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+
+from torch import Tensor
+
+from pipeline.avatar import Decoded, Posed
+from pipeline.avatar.sparse import SparsePair
+from pipeline.clip.composite import over
+from pipeline.clip.views import View
+from pipeline.metrics import Lpips
+from pipeline.splat import Rendering
+from stages.train import losses
+from stages.train.face import Pasted, face_triangles, paste
+from stages.train.poses import PoseRefinement
+from stages.train.regularisers import Regions, unmixed
+from stages.train.schedule import Draw
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StaticAvatar:
+    """The part of the avatar that no pose changes, once a step.
+
+    Attributes:
+        decoded: the static heads' output.
+        regions: of its mesh.
+    """
+
+    decoded: Decoded
+    regions: Regions
+
+    @property
+    def neighbours(self) -> SparsePair:
+        """The mean over each vertex's neighbours, [N, N]."""
+        return self.decoded.surface.neighbours
+
+    @property
+    def normals(self) -> Tensor:
+        """The canonical normals, [N, 3]."""
+        return self.decoded.surface.canonical.frames[:, :, 2]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderedFrame(StaticAvatar):
+    """One drawn frame and the avatar rendered in its pose.
+
+    Attributes:
+        draw: its random values.
+        view: the frame.
+        posed: the avatar in the frame's pose.
+        rendering: of it.
+        refinement: the poses that move; None where the frame is rendered in its fitted pose.
+        texture: [N, 3], the mean colour at each Gaussian; None where no term asks for it.
+        network: LPIPS; None where it has no weight.
+        crop_side: of the square that LPIPS is taken of, pixels; 0 for the whole picture.
+    """
+
+    draw: Draw
+    view: View
+    posed: Posed
+    rendering: Rendering
+    refinement: PoseRefinement | None
+    texture: Tensor | None  # [N, 3]
+    network: Lpips | None
+    crop_side: int
+
+    @cached_property
+    def target(self) -> Tensor:
+        """The person over the drawn background, [H, W, 3]."""
+        return self.view.composite(self.draw.background)
+
+    @cached_property
+    def image(self) -> Tensor:
+        """The rendering over the drawn background, [H, W, 3]; the target where that is not to be trusted."""
+        image = over(self.rendering.color, self.rendering.alpha, self.draw.background)
+        if self.view.trust is None:
+            return image
+        return losses.blend_to_target(image, self.target, self.view.trust)
+
+    @property
+    def crops(self) -> tuple[Tensor, Tensor]:
+        """A square of image and target around a drawn place of the person, [side, side, 3] each."""
+        place = losses.person_crop(self.view.alpha, self.crop_side, self.draw.place)
+        return self.image[place], self.target[place]
+
+    @property
+    def colors(self) -> Tensor:
+        """The Gaussians' colours, [N, 3]."""
+        return self.posed.gaussians.colors
+
+    @cached_property
+    def unmixed(self) -> Tensor | None:
+        """The weight of smoothness terms, [N, 1]; None where the pose heads were asked for every Gaussian."""
+        rows = self.posed.rows
+        return None if rows is None else unmixed(rows, self.neighbours, len(self.colors))
+
+    @property
+    def offset(self) -> Tensor | None:
+        """Static and pose-dependent offset together, [N, 3], metres; None while the pose heads are off."""
+        change = self.posed.pose_offset
+        return None if change is None else self.decoded.offset + change
+
+    @property
+    def underside_contrast(self) -> Tensor | None:
+        """The arms' lower sides less the upper sides above them, [M, 3]; the upper sides get no gradient."""
+        sides = self.regions.undersides
+        return None if sides is None else self.colors[sides.rows] - sides.above @ self.colors.detach()
+
+    @property
+    def pose_change(self) -> Tensor | None:
+        """The change of the frame's pose, [D], by ``PoseRefinement.change``; None where it does not move."""
+        return None if self.refinement is None else self.refinement.change(self.draw.frame)
+
+    @cached_property
+    def face(self) -> Pasted:
+        """The pixels that the face covers, in its mean texture.
+
+        Raises:
+            ValueError: there is no texture.
+        """
+        if self.texture is None:
+            raise ValueError("the face term needs a texture")
+        surface, means = self.decoded.surface, self.posed.gaussians.means
+        canonical, texture = surface.canonical, surface.pick(self.texture)
+        return paste(self.view.camera, means, canonical.faces, face_triangles(canonical), texture)
