@@ -1,4 +1,4 @@
-"""What stands still behind the person, learnt from the clip itself.
+"""The background that stands still behind the person, learnt from the clip itself.
 
 Each pixel's mean colour and spread over the frames in which the person is surely elsewhere. Where the
 camera or the scene moves the spread is wide, and the pixel counts as unknown.
@@ -23,13 +23,13 @@ class Background:
     """The background's mean and spread, summed up frame by frame."""
 
     def __init__(self, height: int, width: int) -> None:
-        """Know nothing yet."""
+        """Begin without a frame; pixels."""
         self._count = np.zeros((height, width), np.float32)
         self._sum = np.zeros((height, width, 3), np.float64)
         self._squares = np.zeros((height, width), np.float64)
 
     def add(self, image: np.ndarray, alpha: np.ndarray) -> None:
-        """Learn from one frame.
+        """Take in one frame.
 
         Args:
             image: [H, W, 3] uint8.
@@ -43,7 +43,7 @@ class Background:
         self._squares += np.square(colour).mean(-1)
 
     def model(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean colour [H, W, 3], spread [H, W] in grey levels, and trust in both, [H, W] in [0, 1]."""
+        """Mean colour [H, W, 3], spread [H, W] in grey levels, and confidence [H, W] in [0, 1]; float32."""
         count = np.maximum(self._count, 1)
         mean = self._sum / count[..., None]
         spread = np.sqrt(np.maximum(self._squares / count - np.square(mean).mean(-1), 0))
@@ -52,7 +52,7 @@ class Background:
         return mean.astype(np.float32), spread.astype(np.float32), known.astype(np.float32)
 
 
-def learn(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Background | None:
+def learn_background(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Background | None:
     """The background of (image, mask) pairs; None where there are none."""
     background = None
     for image, alpha in pairs:
@@ -67,7 +67,7 @@ def log_odds(alpha: np.ndarray) -> np.ndarray:
     return np.log(safe / (1 - safe))
 
 
-def take_out(
+def subtract_background(
     alpha: np.ndarray,  # [H, W]
     image: np.ndarray,  # [H, W, 3]
     model: tuple[np.ndarray, np.ndarray, np.ndarray],

@@ -1,4 +1,4 @@
-"""How many metres one unit of a model without a scale is, from how the person moves.
+"""The metres of one unit of cameras without a scale, from the person's motion.
 
 In camera axes the person's place c_t is known in metres: the estimator's 3D landmarks have the size of a
 body, and their pixels say how far away it is. The cameras are known up to one factor s, so the person's
@@ -30,21 +30,16 @@ STILL = 1e-9  # squared motion of the cameras, in their unit, below which there 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Metres a unit, and what it rests on.
-
-    Attributes:
-        metres: s.
-        note: for the log.
-    """
+    """Metres a unit (s above), and a note for the log on what it rests on."""
 
     metres: float
     note: str
 
 
-def person_places(
+def person_positions(
     keypoints: Keypoints, focal: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the person is in each camera's axes, by weak perspective.
+    """The person's place in each camera's axes, by weak perspective.
 
     The centroid of trunk and head points (those seen in most frames) in ``pose_world`` metres, whose axes
     are the camera's, is fitted to the same points' pixels: depth = focal / (pixels a metre).
@@ -75,15 +70,10 @@ def person_places(
     return rows, np.concatenate([offset, depth[:, None]], axis=1)
 
 
-def posed_places(frames: np.ndarray, poses: InitialPoses | None) -> tuple[np.ndarray, np.ndarray]:
-    """Where poses that came with a dataset put the root joint in each camera's axes.
+def posed_positions(frames: np.ndarray, poses: InitialPoses | None) -> tuple[np.ndarray, np.ndarray]:
+    """The root joint's place in each camera's axes by poses that came with a dataset.
 
-    Args:
-        frames: [T], frame numbers.
-        poses: of some frames, or None.
-
-    Returns:
-        As ``person_places``; nothing where there are no poses, or they have no place.
+    Takes T frame numbers [T]; returns as :func:`person_positions`, and nothing where poses have no place.
     """
     if poses is None or poses.transl is None:
         return np.zeros(0, int), np.zeros((0, 3))

@@ -197,9 +197,9 @@ def dots(points: np.ndarray, period: float, footprint: np.ndarray) -> np.ndarray
     """Balls on a lattice, cut by the surface: 1 inside, [N]."""
     cell = points / np.float32(period)
     cell = cell - np.round(cell)
-    inside = (cell * cell).sum(1) < 0.36**2
+    in_picture = (cell * cell).sum(1) < 0.36**2
     contrast = _contrast(0.7 * period, footprint)
-    return inside * contrast + (1 - contrast) * 0.2
+    return in_picture * contrast + (1 - contrast) * 0.2
 
 
 def noise(points: np.ndarray, period: float, footprint: np.ndarray, seed: int = 0) -> np.ndarray:

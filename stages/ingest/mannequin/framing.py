@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, joint_index, pose_body
 from pipeline.clip.camera import Camera, facing_camera
-from stages.ingest.mannequin.motion import Motion
+from stages.ingest.mannequin.motion import MannequinMotion
 from stages.ingest.mannequin.spec import VIEWS, MannequinSpec
 
 FOCAL = {"full": 1.2, "upper": 1.5, "head": 2.2}
@@ -26,7 +26,7 @@ _SAMPLES = 24  # frames that are looked at to place the camera
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
+class FramedMotion:
     """A body in its place before a camera.
 
     Attributes:
@@ -40,7 +40,9 @@ class Shot:
     poses: Poses
 
 
-def frame_shot(spec: MannequinSpec, body: BodyModel, identity: Identity, motion: Motion) -> Shot:
+def frame_motion(
+    spec: MannequinSpec, body: BodyModel, identity: Identity, motion: MannequinMotion
+) -> FramedMotion:
     """Put the body where the framing wants it.
 
     ``full`` shows the whole body in every frame, ``upper`` what is above the waist, ``head`` what is
@@ -73,10 +75,10 @@ def frame_shot(spec: MannequinSpec, body: BodyModel, identity: Identity, motion:
         middle[1] += (1 - _FILL) / _FILL * float(top - bottom) / 2
     centre = torch.tensor([0.0, 0.0, -distance])
     poses = Poses(tuple(range(spec.frames)), motion.rotation, motion.expression, root + (centre - middle))
-    return Shot(camera, centre, poses)
+    return FramedMotion(camera, centre, poses)
 
 
-def unseen_camera(shot: Shot, name: str) -> Camera:
+def unseen_camera(shot: FramedMotion, name: str) -> Camera:
     """A camera of ``VIEWS``: the pipeline's own, carried about the middle of what is framed."""
     azimuth, elevation = (math.radians(angle) for angle in VIEWS[name])
     about = roma.euler_to_rotmat("YX", [azimuth, -elevation])
@@ -85,7 +87,7 @@ def unseen_camera(shot: Shot, name: str) -> Camera:
     return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
 
 
-def inside(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+def in_picture(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Whether pixels [..., 2] lie in the picture, [...] bool."""
     return np.logical_and.reduce((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=-1)
 

@@ -24,7 +24,7 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class MannequinMotion:
     """A motion that no place in the world is given to yet, T frames, float32.
 
     Attributes:
@@ -66,7 +66,9 @@ class _Draft:
         return height * np.clip((self.wave(-1, 1, slow, quick) - threshold) / (1 - threshold), 0, 1)
 
 
-def make_motion(spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], expressions: int) -> Motion:
+def make_motion(
+    spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], expressions: int
+) -> MannequinMotion:
     """The motion that a spec names.
 
     Args:
@@ -90,13 +92,13 @@ def make_motion(spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], e
         _LAYERS[name](draft)
     if not spec.is_bvh:
         _stand(draft)
-        return Motion(
+        return MannequinMotion(
             _composed(draft.turns), torch.from_numpy(draft.expression).float(), torch.zeros(spec.frames, 3)
         )
     rotation, root = retarget(read_bvh(Path(spec.motion)), joints, parents, spec.frames, spec.fps)
     face = [joint_index(name) for name in ("jaw", "left_eye", "right_eye")]
     rotation[:, face] = _composed(draft.turns)[:, face]
-    return Motion(rotation, torch.from_numpy(draft.expression).float(), root)
+    return MannequinMotion(rotation, torch.from_numpy(draft.expression).float(), root)
 
 
 def _composed(turns: np.ndarray) -> Tensor:

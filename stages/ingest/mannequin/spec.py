@@ -96,7 +96,7 @@ class MannequinSpec:
         return tuple((self.motion or DEFAULT_MOTION[self.framing]).split("+"))
 
 
-def spec_of(settings: Any) -> MannequinSpec:
+def mannequin_spec(settings: Any) -> MannequinSpec:
     """The clip that the ingest stage's settings describe.
 
     ``settings.mannequin`` is the framing, and ``settings.mannequin_<field>`` any other field of the

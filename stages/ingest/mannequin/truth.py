@@ -41,9 +41,8 @@ from pipeline.body import (
 from pipeline.body.landmarks import join
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.files.tables import read_table, vectors, write_table
-from stages.ingest.mannequin.framing import inside
-from stages.ingest.mannequin.limbs import limbs_of_joints
-from stages.ingest.mannequin.scene import Picture
+from stages.ingest.mannequin.framing import in_picture
+from stages.ingest.mannequin.scene import RenderedFrame, limbs_of_joints
 
 OUTSIDE, HIDDEN, SEEN = 0, 1, 2
 """States of a point: not in the picture, behind something, or in view."""
@@ -88,7 +87,7 @@ class Truth:
 
 
 @dataclasses.dataclass(frozen=True)
-class Places:
+class BodyPoints:
     """Where the body's joints and landmarks are: K = 55 joints, then the four sets of landmarks.
 
     Attributes:
@@ -104,7 +103,7 @@ class Places:
     sets: dict[str, slice]
 
 
-def find_places(body: BodyModel, landmarks: Landmarks, identity: Identity, poses: Poses) -> Places:
+def pose_points(body: BodyModel, landmarks: Landmarks, identity: Identity, poses: Poses) -> BodyPoints:
     """Pose the joints and the few vertices that landmarks touch."""
     every = PointSet(
         torch.arange(55), torch.zeros(55, 3, dtype=torch.long), torch.tensor([[1.0, 0, 0]]).expand(55, 3)
@@ -130,7 +129,7 @@ def find_places(body: BodyModel, landmarks: Landmarks, identity: Identity, poses
         name: slice(int(a), int(b))
         for name, a, b in zip(("joints", *names), starts, starts[1:], strict=False)
     }
-    return Places(world, thickness.numpy(), limbs_of_joints(points.joint), sets)
+    return BodyPoints(world, thickness.numpy(), limbs_of_joints(points.joint), sets)
 
 
 def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,7 +144,7 @@ def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple
     return posed_joints(rotation, joints, part.parents) + shift, vertices + shift
 
 
-def states(camera: Camera, picture: Picture, places: Places, row: int) -> np.ndarray:
+def point_states(camera: Camera, picture: RenderedFrame, places: BodyPoints, row: int) -> np.ndarray:
     """Whether each joint and landmark is seen in one frame.
 
     Args:
@@ -187,7 +186,7 @@ def _samples(
     away = to_camera(camera, points)[:, 2].numpy()
     scale = np.array([depth.shape[1] / camera.width, depth.shape[0] / camera.height])
     place = (np.clip(pixels, 0, [camera.width - 1e-6, camera.height - 1e-6]) * scale).astype(int)
-    return inside(camera, pixels) & (away > 0), place[:, 1], place[:, 0], away
+    return in_picture(camera, pixels) & (away > 0), place[:, 1], place[:, 0], away
 
 
 def write_truth(folder: Path, truth: Truth, body: BodyModel) -> None:

@@ -15,9 +15,9 @@ import pycolmap
 
 from pipeline.clip.frames import read_mask, write_mask
 from pipeline.clip.spread import spread_end_to_end
+from stages.ingest.cameras.background_motion import background_mask
 from stages.ingest.cameras.calibration import Calibration
-from stages.ingest.cameras.colmap import model_views
-from stages.ingest.cameras.motion import person_free
+from stages.ingest.cameras.calibration_files import model_views
 
 MOST_FRAMES = 200  # that are mapped, evenly spread; the others lie between them
 FEATURES = 2048
@@ -73,7 +73,7 @@ def structure_from_motion(
 def _write_masks(output: Path, folder: Path, frames: Sequence[int]) -> None:
     """COLMAP looks for NAME.png beside the picture NAME and leaves out its black pixels."""
     for frame in frames:
-        write_mask(folder, frame, person_free(read_mask(output / "masks", frame)))
+        write_mask(folder, frame, background_mask(read_mask(output / "masks", frame)))
         (folder / f"{frame:06d}.png").rename(folder / f"{frame:06d}.png.png")
 
 

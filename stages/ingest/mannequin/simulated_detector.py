@@ -38,9 +38,9 @@ from scipy.special import expit, ndtr
 
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, empty_keypoints
-from stages.ingest.mannequin.framing import inside
+from stages.ingest.mannequin.framing import in_picture
 from stages.ingest.mannequin.spec import MannequinSpec
-from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, Places
+from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, BodyPoints
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,9 @@ class _Set:
         return (self.state == SEEN).mean(1)
 
 
-def detect(spec: MannequinSpec, camera: Camera, places: Places, state: np.ndarray) -> Keypoints:
+def simulate_detections(
+    spec: MannequinSpec, camera: Camera, places: BodyPoints, state: np.ndarray
+) -> Keypoints:
     """The detections of the whole clip.
 
     Args:
@@ -155,7 +157,7 @@ def detect(spec: MannequinSpec, camera: Camera, places: Places, state: np.ndarra
     if detector.in_picture:
         blank = empty_keypoints(found.frames)
         return dataclasses.replace(blank, whole_body=found.whole_body)
-    found.whole_body[~inside(camera, found.whole_body[..., :2])] = 0  # as the ingest stage writes them
+    found.whole_body[~in_picture(camera, found.whole_body[..., :2])] = 0  # as the ingest stage writes them
     return found
 
 
@@ -174,7 +176,7 @@ class _Detector:
         self.rng = np.random.default_rng([spec.seed, 7])
         self.too_short = self.rng.standard_normal()  # a guessed body is too short as a whole
 
-    def look(self, places: Places, state: np.ndarray, name: str) -> _Set:
+    def look(self, places: BodyPoints, state: np.ndarray, name: str) -> _Set:
         """The points of one set in the camera."""
         rows = places.sets[name]
         world = places.world[:, rows]
@@ -243,7 +245,7 @@ class _Detector:
             points[missed, :, 3] = np.minimum(points[missed, :, 3], 0.2)
         else:
             points[missed] = 0
-            points[~inside(self.camera, points[..., :2])] = 0
+            points[~in_picture(self.camera, points[..., :2])] = 0
 
     def fail_hands(self, hands: np.ndarray) -> None:
         """Spoil some hands [T, 2, 21, 4], in place, for one to three frames each."""
