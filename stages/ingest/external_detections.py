@@ -33,7 +33,7 @@ _REMEDY = "write it again as 133 [x, y, score] or as mmpose's results"
 
 @dataclasses.dataclass(frozen=True)
 class DetectionSources:
-    """Where the keypoints and masks of a shot come from.
+    """The files and models that give a shot's keypoints and masks.
 
     Attributes:
         mediapipe: the asset's folder; None where nothing is asked of it.

@@ -62,12 +62,11 @@ def refine_masks(context: Context, keypoints: Keypoints, raw: Path) -> None:
             yield read_frame(output / "frames", frame), fuse(*read_segmentations(raw, frame), share)
 
     background = learn_background(fused()) if settings.background else None
-    model = background.model() if background else None
 
     def cut() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for row, (image, alpha) in enumerate(fused()):
-            if model is not None:
-                alpha = subtract_background(alpha, image, model)
+            if background is not None:
+                alpha = subtract_background(alpha, image, background)
             points = keypoints.whole_body[row, BODY]
             seeds = points[points[:, 2] >= SEED_SCORE, :2]
             alpha = fill_holes(main_component(alpha, seeds))

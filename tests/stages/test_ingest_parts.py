@@ -67,7 +67,7 @@ def test_nobody() -> None:
 
 def test_tracks_follow_people_who_pass_each_other_slowly() -> None:
     looks = [(frame, [person(40 + 4 * frame, 30), person(160 - 4 * frame, 12, y=20)]) for frame in range(30)]
-    sizes = [{one.radius for one in track.people.values()} for track in people.link(looks)]
+    sizes = [{one.radius for one in track.people.values()} for track in people.link_detections(looks)]
     assert sorted(sizes, key=min) == [{1.8 * 12}, {1.8 * 30}]
 
 
@@ -282,7 +282,7 @@ def test_a_still_background_is_taken_out_and_the_person_is_not() -> None:
     sloppy = truth[8].copy()
     sloppy[20:40, 5:20] = 0.7  # a piece of wall that the segmentation took in
     assert truth[8][20:40, 5:20].max() == 0
-    cleaned = subtract_background(sloppy, frames[8], background.model())
+    cleaned = subtract_background(sloppy, frames[8], background)
     assert cleaned[22:38, 7:18].max() < 0.3
     assert cleaned[truth[8] > 0].min() > 0.9
 
@@ -292,9 +292,9 @@ def test_a_moving_background_is_left_alone() -> None:
     frames = [rng.integers(0, 256, (40, 50, 3), dtype=np.uint8) for _ in range(12)]
     nowhere = [np.zeros((40, 50), np.float32)] * 12
     background = learn_background(zip(frames, nowhere, strict=True))
-    assert background is not None and background.model()[2].max() == 0
+    assert background is not None and background.confidence.max() == 0
     mask = rng.uniform(0.1, 0.9, (40, 50)).astype(np.float32)
-    np.testing.assert_allclose(subtract_background(mask, frames[0], background.model()), mask, atol=1e-5)
+    np.testing.assert_allclose(subtract_background(mask, frames[0], background), mask, atol=1e-5)
 
 
 def test_no_frames_no_background() -> None:

@@ -82,7 +82,7 @@ def choose_cameras(
         UserError: the calibration is not of this footage.
     """
     settings = context.settings
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     if given is not None:
         return _from_calibration(context, clip, detected, given, poses)
     record: dict[str, Any] = {"source": "pinhole", "displacement": None, "metres_per_unit": None}
@@ -103,13 +103,13 @@ def choose_cameras(
 
 
 def kept_fps(context: Context, clip: Clip) -> float:
-    """Kept frames a second: of a clip of which every ``ingest.stride``-th frame is read."""
+    """Kept frames a second where every ``ingest.stride``-th frame of the clip is read."""
     return (clip.fps or 25.0) / context.settings.stride
 
 
 def _find(context: Context, clip: Clip, detected: DetectedClip) -> ClipCameras | None:
     """Cameras from the background's motion; None where it gives none."""
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     width, height = detected.width, detected.height
     focal = context.settings.focal * max(width, height)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
@@ -118,7 +118,7 @@ def _find(context: Context, clip: Clip, detected: DetectedClip) -> ClipCameras |
         centre = (width / 2, height / 2)
         found = structure_from_motion(context.output, context.work / "sfm", frames, focal, centre)
         if not isinstance(found, str):
-            return _from_model(context, clip, detected, found, frames)
+            return _from_model(context, clip, detected, found)
         context.log(f"cameras: structure from motion failed: {found}")
     rotations = chain_rotations(context.output, frames, matrix) if share <= MOSTLY_ROTATION else None
     if rotations is None:
@@ -127,18 +127,14 @@ def _find(context: Context, clip: Clip, detected: DetectedClip) -> ClipCameras |
         )
         return None
     context.log(f"cameras: rotations only, which leave {share:.1%} of the background's motion unexplained")
-    turned = to_upright_world(np.stack(rotations), np.zeros((len(frames), 3)))
     lens = pinhole_lens(width, height, (focal, focal), (width / 2, height / 2))
-    views = {
-        frame: CalibratedCamera(lens, turned[0][row], turned[1][row]) for row, frame in enumerate(frames)
-    }
-    return ClipCameras(_cameras(views), {}, {"source": "rotation", "unexplained": round(share, 6)})
+    views = {f: CalibratedCamera(lens, r, np.zeros(3)) for f, r in zip(frames, rotations, strict=True)}
+    return ClipCameras(_cameras(_settled(views)), {}, {"source": "rotation", "unexplained": round(share, 6)})
 
 
-def _from_model(
-    context: Context, clip: Clip, detected: DetectedClip, model: Calibration, frames: list[int]
-) -> ClipCameras:
-    """The frames of a model of this clip, those between them, in metres."""
+def _from_model(context: Context, clip: Clip, detected: DetectedClip, model: Calibration) -> ClipCameras:
+    """The cameras of a model of this clip and of the frames between them, in metres."""
+    frames = detected.keypoints.frames.tolist()
     known = {int(name[:-4]): view for name, view in model.views.items()}
     lens = next(iter(known.values())).lens
     mapped = mapped_frames(frames)
@@ -163,7 +159,7 @@ def _from_calibration(
     context: Context, clip: Clip, detected: DetectedClip, given: Calibration, poses: InitialPoses | None
 ) -> ClipCameras:
     """The cameras that the user or the dataset gives."""
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     stored = {
         name: for_stored_frames(view, clip, detected.width, detected.height, given.path)
         for name, view in given.views.items()
@@ -221,8 +217,9 @@ def _metric(
     poses: InitialPoses | None = None,
 ) -> tuple[dict[int, CalibratedCamera], Scale]:
     """The views with translations in metres."""
-    scale = Scale(context.settings.camera_scale, f"{context.settings.camera_scale:g} metres a unit, as set")
-    if not scale.metres:
+    given = context.settings.camera_scale
+    scale = Scale(given, f"{given:g} metres a unit, as set")
+    if not given:
         rows = np.flatnonzero(np.isin(keypoints.frames, list(views)))
         chosen = [views[int(frame)] for frame in keypoints.frames[rows]]
         lenses = [view.lens for view in chosen]
@@ -231,27 +228,22 @@ def _metric(
         placed, places = posed_positions(keypoints.frames[rows], poses)
         if not len(placed):
             placed, places = person_positions(keypoints.select(rows), focal, centre)
-        rotations, translations = (
-            np.stack([getattr(v, n) for v in chosen]) for n in ("rotation", "translation")
-        )
-        scale = metric_scale(rotations[placed], translations[placed], places, fps, model.depth)
-    return {
-        frame: dataclasses.replace(view, translation=view.translation * scale.metres)
-        for frame, view in views.items()
-    }, scale
+        rotations = np.stack([view.rotation for view in chosen])[placed]
+        translations = np.stack([view.translation for view in chosen])[placed]
+        scale = metric_scale(rotations, translations, places, fps, model.depth)
+    metres = scale.metres
+    scaled = {f: dataclasses.replace(v, translation=v.translation * metres) for f, v in views.items()}
+    return scaled, scale
 
 
 def _settled(views: Mapping[int, CalibratedCamera]) -> dict[int, CalibratedCamera]:
     """The same cameras in an upright world."""
     order = sorted(views)
-    rotations, translations = to_upright_world(
-        np.stack([views[frame].rotation for frame in order]),
-        np.stack([views[frame].translation for frame in order]),
+    parts = (
+        np.stack([getattr(views[frame], name) for frame in order]) for name in ("rotation", "translation")
     )
-    return {
-        frame: dataclasses.replace(views[frame], rotation=rotations[row], translation=translations[row])
-        for row, frame in enumerate(order)
-    }
+    poses = zip(order, *to_upright_world(*parts), strict=True)
+    return {frame: dataclasses.replace(views[frame], rotation=r, translation=t) for frame, r, t in poses}
 
 
 def _cameras(views: Mapping[int, CalibratedCamera]) -> dict[int, Camera]:

@@ -6,14 +6,14 @@
     masks/12.png                     above one half is the person
     cam_params/12.json               {R, t, focal, princpt}, or sparse/ from COLMAP (names image12.jpg)
     keypoints_whole_body/12.json     133 [x, y, score], pixels
-    smplx_init/, smplx_optimized/    see ``fitted``
+    smplx_init/, smplx_optimized/    see ``exavatar_poses``
     frame_list_{all,train,test}.txt  a number a line
 
 Source: the releases of ExAvatar (mks0601/ExAvatar_RELEASE) and FlexiAvatar (yihalem1/FlexiAvatar_Release).
 FlexiAvatar's make_frame_list.py writes the same numbers into all three lists: a test list that is the
 training list holds nothing out, and then the clip's end is. A ``_gen`` folder (generated views) has a
 training list only; its frames are all learnt from. No conversion is needed but that of the poses, which
-``fitted`` states.
+``exavatar_poses`` states.
 """
 
 from __future__ import annotations

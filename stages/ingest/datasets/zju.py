@@ -47,9 +47,9 @@ _REMEDY = "unpack the ZJU-MoCap subject again"
 
 @dataclasses.dataclass(frozen=True)
 class RigCamera:
-    """A camera: as it is handed on, and as annots.npy has it (world-to-camera, metres)."""
+    """A camera in our world, and as annots.npy has it (world-to-camera, metres)."""
 
-    view: CalibratedCamera
+    calibrated: CalibratedCamera
     rotation: np.ndarray
     translation: np.ndarray
 
@@ -67,11 +67,11 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     count = len(names[0])
     train = _camera(settings.camera_name or str(TRAIN_CAMERA), count, path)
     test = _held_out(settings.test_cameras, train, count, path)
-    eyes = _eyes(annots, [train, *test], source, names)
+    cameras = _cameras(annots, [train, *test], source, names)
     several = bool(test)
-    shots = [_shot(source, names, train, 0, eyes[0], list(TRAIN_FRAMES) if several else None, path)]
+    shots = [_shot(source, names, train, 0, cameras[0], list(TRAIN_FRAMES) if several else None, path)]
     for place, camera in enumerate(test, start=1):
-        shots.append(_shot(source, names, camera, place * SHOT_STEP, eyes[place], list(TEST_FRAMES), path))
+        shots.append(_shot(source, names, camera, place * SHOT_STEP, cameras[place], list(TEST_FRAMES), path))
     if not several:
         return Recording("zju", tuple(shots))
     held = frozenset(frame for shot in shots[1:] for frame in shot.clip.pictures)
@@ -103,8 +103,8 @@ def _held_out(names: tuple[str, ...], train: int, count: int, path: Path) -> lis
     return [camera for camera in (_camera(name, count, path) for name in names) if camera != train]
 
 
-def _eyes(annots: Any, cameras: list[int], source: Path, names: list[list[str]]) -> list[RigCamera]:
-    """The cameras in one world, in which the first one stands as ``cameras.world`` says."""
+def _cameras(annots: Any, cameras: list[int], source: Path, names: list[list[str]]) -> list[RigCamera]:
+    """The cameras in one upright world, whose origin is the first one (``cameras.extrinsics``)."""
     path = source / "annots.npy"
     tables = entry(annots, "cams", path, _REMEDY)
     rotations, translations, lenses = [], [], []
@@ -139,7 +139,7 @@ def _shot(
     names: list[list[str]],
     camera: int,
     first: int,
-    eye: RigCamera,
+    view: RigCamera,
     chosen: list[int] | None,
     path: Path,
 ) -> Shot:
@@ -149,15 +149,15 @@ def _shot(
     masks = {frame: _mask(source, names[frame][camera], path) for frame in frames}
     found = {first + frame: mask for frame, mask in masks.items() if mask.is_file()}
     clip = folder_clip(source, {first + frame: file for frame, file in pictures.items()}, FPS)
-    calibration = Calibration(path, "ZJU-MoCap", {EVERY_FRAME: eye.view}, metric=True, upright=True)
-    return Shot(clip, calibration, None, found or None, "nonzero", _poses(source, frames, first, eye))
+    calibration = Calibration(path, "ZJU-MoCap", {EVERY_FRAME: view.calibrated}, metric=True, upright=True)
+    return Shot(clip, calibration, None, found or None, "nonzero", _poses(source, frames, first, view))
 
 
 def _mask(source: Path, name: str, path: Path) -> Path:
     return inside(source / "mask", name, path).with_suffix(".png")
 
 
-def _poses(source: Path, frames: list[int], first: int, eye: RigCamera) -> InitialPoses | None:
+def _poses(source: Path, frames: list[int], first: int, view: RigCamera) -> InitialPoses | None:
     """SMPL's poses in the axes of one camera."""
     paths = {frame: source / "smpl_params" / f"{frame}.npy" for frame in frames}
     known = [frame for frame, path in paths.items() if path.is_file()]
@@ -171,8 +171,8 @@ def _poses(source: Path, frames: list[int], first: int, eye: RigCamera) -> Initi
             for key, shape in (("Rh", (3,)), ("Th", (3,)), ("poses", (72,)), ("shapes", (-1,)))
         }
         turn = Rotation.from_rotvec(parts["Rh"]).as_matrix()
-        turns.append(eye.rotation @ turn)
-        places.append(eye.rotation @ (turn @ SMPL_ROOT + parts["Th"]) + eye.translation)
+        turns.append(view.rotation @ turn)
+        places.append(view.rotation @ (turn @ SMPL_ROOT + parts["Th"]) + view.translation)
         poses.append(parts["poses"])
         shapes.append(parts["shapes"])
     placed = [first + frame for frame in known]

@@ -1,4 +1,4 @@
-"""Cameras: the one that the pipeline is given, and those that it never sees."""
+"""The pipeline's camera before the body, and the unseen ones about it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SAMPLES = 24  # frames that are looked at to place the camera
 
 @dataclasses.dataclass(frozen=True)
 class FramedMotion:
-    """A body in its place before a camera.
+    """The pipeline's camera and the motion placed before it.
 
     Attributes:
         camera: the one that the pipeline is given; it stands at the world's origin.
@@ -43,7 +43,7 @@ class FramedMotion:
 def frame_motion(
     spec: MannequinSpec, body: BodyModel, identity: Identity, motion: MannequinMotion
 ) -> FramedMotion:
-    """Put the body where the framing wants it.
+    """The body's motion placed so that the camera sees what the framing asks for.
 
     ``full`` shows the whole body in every frame, ``upper`` what is above the waist, ``head`` what is
     above the collarbones; hands may leave the picture in the latter two.
@@ -88,7 +88,7 @@ def unseen_camera(shot: FramedMotion, name: str) -> Camera:
 
 
 def in_picture(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Whether pixels [..., 2] lie in the picture, [...] bool."""
+    """True where pixels [..., 2] lie in the picture, [...] bool."""
     return np.logical_and.reduce((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""How the mannequin moves: generated motions that add up, or motion capture. Radians and metres."""
+"""The mannequin's motion: generated layers that add up, or motion capture. Radians and metres."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 
 @dataclasses.dataclass(frozen=True)
 class MannequinMotion:
-    """A motion that no place in the world is given to yet, T frames, float32.
+    """A motion before it is placed in the world, T frames, float32.
 
     Attributes:
         rotation: [T, 55, 3], rotation vectors relative to the parent joint.

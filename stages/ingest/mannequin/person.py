@@ -1,4 +1,4 @@
-"""Who the mannequin is: a random identity with truth in all three of its parts."""
+"""The mannequin's random identity: betas, joint offsets and face offsets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filming the mannequin: one lamp, a still background, two samples a pixel in each direction."""
+"""The mannequin rendered: one lamp, a still background, two samples a pixel in each direction."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _OF_PART = np.array([_LIMBS.get(part, 0) for part in PARTS], np.int8)
 
 @dataclasses.dataclass(frozen=True)
 class RenderedFrame:
-    """What a camera sees.
+    """One frame as a camera sees it.
 
     Attributes:
         image: [H, W, 3] uint8 RGB.
@@ -56,7 +56,7 @@ class RenderedFrame:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything that is before the cameras.
+    """The clothed body, its motion and its looks.
 
     Attributes:
         body: the body.
@@ -106,7 +106,7 @@ def limbs_of_joints(joint: Tensor) -> np.ndarray:
 def make_scene(
     body: BodyModel, clothed: Identity, appearance: Appearance, shot: FramedMotion, seed: int
 ) -> Scene:
-    """Put a person with a look and a motion before the cameras."""
+    """The scene of a person with a look and a motion."""
     transforms = joint_transforms(shot.poses.rotation, rest_joints(body, clothed), body.parents)
     rest, limbs = rest_vertices(body, clothed), limbs_of_vertices(body)
     return Scene(body, clothed, appearance, shot, seed, rest, transforms, limbs)

@@ -1,4 +1,4 @@
-"""Keypoint detectors with known errors: what an estimator would say of the mannequin.
+"""Simulated keypoint detectors, whose errors on the mannequin are known.
 
 ``mediapipe`` errs as MediaPipe 0.10.21 (holistic) was measured to, on pictures of mannequins in the three
 framings (against their truth: 4 clips of 60 frames in each, two people, 256 px; for hidden points 3 clips
@@ -45,7 +45,7 @@ from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, BodyPoints
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """How one kind of point is detected; lengths in metres, standard deviations in each direction.
+    """The errors of one kind of point; metres, standard deviations in each direction.
 
     Attributes:
         seen: error of a seen point.
@@ -99,8 +99,8 @@ _FEW_FOUND, _FOUND = 0.22, 0.85  # of the frames in which a little or more of a 
 
 
 @dataclasses.dataclass(frozen=True)
-class _Set:
-    """One set of points as the detector sees it: T frames, K points.
+class _TruePoints:
+    """The true places and states of one set of points, T frames, K points.
 
     Attributes:
         camera: [T, K, 3], metres in the camera's frame of reference.
@@ -112,12 +112,12 @@ class _Set:
     pixels: np.ndarray
     state: np.ndarray
 
-    def __getitem__(self, columns: slice) -> _Set:
-        return _Set(self.camera[:, columns], self.pixels[:, columns], self.state[:, columns])
+    def __getitem__(self, columns: slice) -> _TruePoints:
+        return _TruePoints(self.camera[:, columns], self.pixels[:, columns], self.state[:, columns])
 
     @property
     def share_seen(self) -> np.ndarray:
-        """[T]."""
+        """The share of points in view, [T]."""
         return (self.state == SEEN).mean(1)
 
 
@@ -134,7 +134,7 @@ def simulate_detections(
     """
     detector = _Detector(spec, camera)
     whole, pose, hands, mesh = (
-        detector.look(places, state, name) for name in ("whole_body", "pose", "hands", "face_mesh")
+        detector.truth_of(places, state, name) for name in ("whole_body", "pose", "hands", "face_mesh")
     )
     found = empty_keypoints(np.arange(spec.frames))
     for side in (0, 1):
@@ -162,11 +162,7 @@ def simulate_detections(
 
 
 class _Detector:
-    """The detector's state: its random draws.
-
-    Attributes:
-        in_picture: whether every point is put inside the picture.
-    """
+    """A detector with its random draws; ``in_picture`` is true where it puts every point inside the picture."""
 
     def __init__(self, spec: MannequinSpec, camera: Camera) -> None:
         self.spec, self.camera = spec, camera
@@ -176,23 +172,23 @@ class _Detector:
         self.rng = np.random.default_rng([spec.seed, 7])
         self.too_short = self.rng.standard_normal()  # a guessed body is too short as a whole
 
-    def look(self, places: BodyPoints, state: np.ndarray, name: str) -> _Set:
+    def truth_of(self, places: BodyPoints, state: np.ndarray, name: str) -> _TruePoints:
         """The points of one set in the camera."""
         rows = places.sets[name]
         world = places.world[:, rows]
-        return _Set(
+        return _TruePoints(
             to_camera(self.camera, world).double().numpy(),
             project(self.camera, world).double().numpy(),
             state[:, rows],
         )
 
-    def as_a_whole(self, truth: _Set) -> _Set:
+    def as_a_whole(self, truth: _TruePoints) -> _TruePoints:
         """A hand or face as a model of its own sees it: found with its points outside, or not at all."""
         if self.in_picture:
             return truth
         return dataclasses.replace(truth, state=np.maximum(truth.state, HIDDEN))
 
-    def points(self, truth: _Set, parts: tuple[_Part, ...]) -> np.ndarray:
+    def points(self, truth: _TruePoints, parts: tuple[_Part, ...]) -> np.ndarray:
         """Detections [T, K, 4] float32: x, y, z in pixels, z about the set's middle, and a score.
 
         Args:
@@ -213,7 +209,7 @@ class _Detector:
         score = self._scores(truth.state, np.linalg.norm(away, axis=-1), parts)
         return np.concatenate([xy, z[..., None], score[..., None]], axis=-1).astype(np.float32)
 
-    def world(self, pose: _Set, found: np.ndarray) -> np.ndarray:
+    def world(self, pose: _TruePoints, found: np.ndarray) -> np.ndarray:
         """The 33 points in metres about the hips, [T, 33, 4]; a guess is as wrong as in the picture.
 
         Args:
@@ -230,7 +226,7 @@ class _Detector:
         places = (places - places[:, 23:25].mean(1, keepdims=True)) * scale
         return np.concatenate([places, found[..., 3:]], axis=-1).astype(np.float32)
 
-    def misses_hand(self, hand: _Set) -> np.ndarray:
+    def misses_hand(self, hand: _TruePoints) -> np.ndarray:
         """In which frames a hand is not found, [T] bool."""
         share = hand.share_seen
         chance = np.where(share >= _FEW_OF_HAND, _FOUND, np.where(share > 0, _FEW_FOUND, 0.0))
@@ -267,17 +263,17 @@ class _Detector:
                 exists = (own[..., 3:] > 0) & ((other[..., 3:] > 0) if jumps else True)
                 hands[rows, side] = np.where(exists, failed, own)
 
-    def _per_metre(self, truth: _Set) -> np.ndarray:
+    def _per_metre(self, truth: _TruePoints) -> np.ndarray:
         """Pixels of a metre at each point, [T, K]."""
         return self.focal / np.maximum(truth.camera[..., 2], 0.1)
 
-    def _outside(self, truth: _Set) -> np.ndarray:
+    def _outside(self, truth: _TruePoints) -> np.ndarray:
         """The way from each point to the picture, [T, K, 2] metres; zero for what is inside."""
         nearest = np.clip(truth.pixels, 0, self.size)
         return (nearest - truth.pixels) / self._per_metre(truth)[..., None]
 
-    def _found(self, truth: _Set, parts: tuple[_Part, ...]) -> np.ndarray:
-        """How far off points inside the picture are, [T, K, 2] metres."""
+    def _found(self, truth: _TruePoints, parts: tuple[_Part, ...]) -> np.ndarray:
+        """The error of points inside the picture, [T, K, 2] metres."""
         floor = _FLOOR / self._per_metre(truth)
         seen = self.spec.noise * (floor + np.array([part.seen for part in parts]))
         hidden = np.array([part.hidden for part in parts]) + floor
@@ -285,7 +281,7 @@ class _Detector:
         return self._drifting(truth.pixels.shape) * sigma[..., None]
 
     def _guessed(self, away: np.ndarray, parts: tuple[_Part, ...]) -> np.ndarray:
-        """How far off points outside the picture are, [T, K, 2] metres: most of it for the whole clip."""
+        """The error of points outside the picture, [T, K, 2] metres, most of it the same in all frames."""
         distance = np.linalg.norm(away, axis=-1, keepdims=True)
         share, aside = (np.array([getattr(part, name) for part in parts]) for name in ("share", "aside"))
         own = self.rng.standard_normal((2, len(parts), 2))
@@ -322,5 +318,5 @@ class _Detector:
 
 
 def _parts(name: str) -> tuple[_Part, ...]:
-    """What each point of an order is."""
+    """The kind of each point of a set, in order."""
     return tuple(_PARTS[kind] for kind, count in _ORDERS[name] for _ in range(count))

@@ -1,4 +1,4 @@
-"""What a mannequin clip shows, in a few words. Imports nothing heavy, so that settings can check it."""
+"""The description of a mannequin's clip. Imports nothing heavy, so that settings can check it."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ DEFAULT_MOTION: Mapping[Framing, str] = {
 
 
 def is_bvh(motion: str) -> bool:
-    """Whether a motion is a motion-capture file."""
+    """True where a motion is a motion-capture file."""
     return motion.lower().endswith(".bvh")
 
 
 def check_motion(motion: str) -> None:
-    """Refuses, with a ValueError, what is neither empty nor a BVH file nor names of ``LAYERS``."""
+    """Refuse a motion that is neither empty nor a BVH file nor names of ``LAYERS``; ValueError."""
     unknown = [] if is_bvh(motion) or not motion else sorted({*motion.split("+")} - {*LAYERS})
     if unknown:
         raise ValueError(
@@ -85,7 +85,7 @@ class MannequinSpec:
 
     @property
     def is_bvh(self) -> bool:
-        """Whether ``motion`` is a motion-capture file."""
+        """True where ``motion`` is a motion-capture file."""
         return is_bvh(self.motion)
 
     @property

@@ -1,4 +1,4 @@
-"""What is known of the mannequin and not told to the pipeline, and its files.
+"""The truth of a mannequin's clip, which the pipeline does not see, and its files.
 
 Written beside what ingest publishes:
 
@@ -88,7 +88,7 @@ class Truth:
 
 @dataclasses.dataclass(frozen=True)
 class BodyPoints:
-    """Where the body's joints and landmarks are: K = 55 joints, then the four sets of landmarks.
+    """The places of the body's joints and landmarks: K = 55 joints, then the four sets of landmarks.
 
     Attributes:
         world: [T, K, 3], metres.
@@ -104,7 +104,7 @@ class BodyPoints:
 
 
 def pose_points(body: BodyModel, landmarks: Landmarks, identity: Identity, poses: Poses) -> BodyPoints:
-    """Pose the joints and the few vertices that landmarks touch."""
+    """The posed joints and landmarks, by posing the few vertices that landmarks touch."""
     every = PointSet(
         torch.arange(55), torch.zeros(55, 3, dtype=torch.long), torch.tensor([[1.0, 0, 0]]).expand(55, 3)
     )
@@ -145,16 +145,13 @@ def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple
 
 
 def point_states(camera: Camera, picture: RenderedFrame, places: BodyPoints, row: int) -> np.ndarray:
-    """Whether each joint and landmark is seen in one frame.
+    """The state of each joint and landmark in one frame, [K] uint8: OUTSIDE, HIDDEN or SEEN.
 
     Args:
         camera: the view.
         picture: what it saw.
         places: joints and landmarks.
         row: the frame.
-
-    Returns:
-        [K] uint8, OUTSIDE, HIDDEN or SEEN.
     """
     points = places.world[row]
     within, rows, columns, away = _samples(camera, picture.depth, points)
@@ -166,7 +163,7 @@ def point_states(camera: Camera, picture: RenderedFrame, places: BodyPoints, row
 def seen_vertices(
     camera: Camera, depth: np.ndarray, vertices: Tensor, tolerance: float = _SURFACE_DEPTH
 ) -> np.ndarray:
-    """Which vertices [V, 3] are in view in one frame: [V] bool. For errors of the seen surface.
+    """True where vertices [V, 3] are in view in one frame, [V] bool.
 
     Args:
         camera: the view.
@@ -181,7 +178,7 @@ def seen_vertices(
 def _samples(
     camera: Camera, depth: np.ndarray, points: Tensor
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For points [K, 3]: whether they are in the picture, their rows and columns in ``depth``, their Z."""
+    """Of points [K, 3]: in the picture or not, their rows and columns in ``depth``, their Z; each [K]."""
     pixels = project(camera, points).double().numpy()
     away = to_camera(camera, points)[:, 2].numpy()
     scale = np.array([depth.shape[1] / camera.width, depth.shape[0] / camera.height])
