@@ -39,7 +39,7 @@ from pipeline.run.job import Job, open_job, run_stage
 from pipeline.splat import render
 from pipeline.store.artifact import Artifact
 from stages.ingest.mannequin.footage import Filming
-from stages.ingest.mannequin.scene import RenderedFrame, Scene, film, make_background
+from stages.ingest.mannequin.scene import FilmedFrame, Scene, film, make_background
 from stages.ingest.mannequin.spec import mannequin_spec
 
 UNSEEN = (135.0, 180.0, 225.0)  # degrees
@@ -164,7 +164,7 @@ def around(scene: Scene, degrees: float) -> Camera:
     return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
 
 
-def _filmed(scene: Scene, frame: int, camera: Camera) -> RenderedFrame:
+def _filmed(scene: Scene, frame: int, camera: Camera) -> FilmedFrame:
     return film(scene, frame, camera, make_background(camera, scene.seed))
 
 

@@ -83,6 +83,7 @@ class FrameDetector:
         self.settings, self.clip, self.sources, self.people = context.settings, clip, sources, found
         self.scale = min(1.0, self.settings.long_side / max(clip.width, clip.height))
         self.width, self.height = (max(1, round(side * self.scale)) for side in (clip.width, clip.height))
+        self.size = np.array([self.width, self.height], np.float32)
         self.estimator_scale = estimator_scale(
             clip.width, clip.height, self.settings.estimator_short_side, self.settings.estimator_long_side
         )
@@ -121,7 +122,7 @@ class FrameDetector:
         assert self.sources.keypoints is not None
         points = read_whole_body(self.sources.keypoints[index])
         points[:, :2] *= [self.width / self.clip.width, self.height / self.clip.height]
-        points[:, 2] *= inside_picture(points, np.array([self.width, self.height], np.float32))
+        points[:, 2] *= inside_picture(points, self.size)
         points[points[:, 2] <= 0] = 0
         return points
 
@@ -131,7 +132,7 @@ class FrameDetector:
             return whole_body[BODY]
         assert landmarks is not None
         points = landmarks.pose[:, [0, 1, 3]].copy()
-        points[:, 2] *= inside_picture(points, np.array([self.width, self.height], np.float32))
+        points[:, 2] *= inside_picture(points, self.size)
         return points
 
     def _masks(
@@ -206,16 +207,9 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
     if settings.stride == 1 and not settings.max_frames:
         for files in (sources.keypoints, sources.masks):
             check_frames(files or {}, numbers)
-    return DetectedClip(
-        keypoints=_stack(kept, detector),
-        seconds=tuple(seconds for _, seconds, _ in kept),
-        width=detector.width,
-        height=detector.height,
-        scale=detector.scale,
-        read=len(numbers),
-        dropped=dict(sorted(dropped.items())),
-        people=everyone.count,
-    )
+    seconds, dropped_for = tuple(seconds for _, seconds, _ in kept), dict(sorted(dropped.items()))
+    size = (detector.width, detector.height, detector.scale)
+    return DetectedClip(_stack(kept, detector), seconds, *size, len(numbers), dropped_for, everyone.count)
 
 
 def _stack(kept: list[tuple[int, float, FrameDetections]], detector: FrameDetector) -> Keypoints:

@@ -18,7 +18,7 @@ from pipeline.config.settings import (
     Side,
     setting,
 )  # fmt: skip
-from stages.ingest.mannequin.spec import Detector, FilmedFrames, Framing, Noise, UnseenView, check_motion
+from stages.ingest.mannequin.spec import Detector, FrameCount, Framing, Noise, UnseenView, check_motion
 
 Layout = Literal[
     "zju", "wildavatar", "insta", "xhumans", "persona", "pose2sim", "neuman", "prepared", "talkshow", "plain"
@@ -88,7 +88,7 @@ class IngestSettings:
     mannequin_motion: str = setting(
         "", "names of its motions joined by '+', or a BVH file; empty for what suits"
     )
-    mannequin_frames: FilmedFrames = setting(60, "how many frames are filmed")
+    mannequin_frames: FrameCount = setting(60, "how many frames are filmed")
     mannequin_size: Side = setting(256, "pixels, both sides of the picture")
     mannequin_fps: FrameRate = setting(25.0, "frames a second")
     mannequin_seed: Seed = setting(0, "of the motion, the detector's errors and the picture's grain")

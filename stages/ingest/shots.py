@@ -150,17 +150,15 @@ def ingest_recording(context: Context, recording: Recording) -> Ingested:
         )
         for place, shot in enumerate(recording.shots)
     ]
-    dropped: Counter[str] = Counter()
-    for part in parts:
-        dropped.update(part.detected.dropped)
     first = parts[0]
+    clips = [part.detected for part in parts]
     detected = dataclasses.replace(
         first.detected,
-        keypoints=Keypoints.concatenate([part.detected.keypoints for part in parts]),
-        seconds=tuple(second for part in parts for second in part.detected.seconds),
-        read=sum(part.detected.read for part in parts),
-        dropped=dict(sorted(dropped.items())),
-        people=max(part.detected.people for part in parts),
+        keypoints=Keypoints.concatenate([clip.keypoints for clip in clips]),
+        seconds=tuple(second for clip in clips for second in clip.seconds),
+        read=sum(clip.read for clip in clips),
+        dropped=dict(sorted(sum((Counter(clip.dropped) for clip in clips), Counter()).items())),
+        people=max(clip.people for clip in clips),
     )
     cameras = {frame: camera for part in parts for frame, camera in part.cameras.items()}
     timings = {name: sum(part.timings[name] for part in parts) for name in first.timings}

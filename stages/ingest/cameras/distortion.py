@@ -26,13 +26,12 @@ GRID = 33  # points a side at which distortion is measured
 def for_stored_frames(
     view: CalibratedCamera, clip: Clip, width: int, height: int, path: Path
 ) -> CalibratedCamera:
-    """A view with the lens of the stored frames: turned as the clip's frames were, and scaled.
+    """A calibrated view with the lens of the stored frames [height, width]: turned as they were, and scaled.
 
     Args:
-        view: as calibrated.
+        view, path: as calibrated, and its file for messages.
         clip: the footage, upright.
         width, height: of the stored frames, pixels.
-        path: the calibration, for messages.
 
     Raises:
         UserError: the calibration is of pictures with other proportions.

@@ -1,12 +1,11 @@
 """The metres of one unit of cameras without a scale, from the person's motion.
 
 In camera axes the person's place c_t is known in metres: the estimator's 3D landmarks have the size of a
-body, and their pixels say how far away it is. The cameras are known up to one factor s, so the person's
-place in the world is X_t = R_t^T (c_t - s t_t) = a_t - s b_t. A wrong s makes the camera's motion shake the
-person, so s is taken where the path is shortest, sum |X_(t+1) - X_t|^2, in closed form. Both a and b are
-smoothed first, by the same filter, which leaves s as it is and takes out the noise of the depths. A person
-who moves with the camera, as in a tracking shot, looks like a small s: bounds from the scene's depth keep
-the background behind the person.
+body, and their pixels give its distance. The cameras are known up to one factor s, so the person's place in
+the world is X_t = R_t^T (c_t - s t_t) = a_t - s b_t. A wrong s makes the camera's motion shake the person, so
+s minimises the path sum |X_(t+1) - X_t|^2, in closed form. a and b are smoothed first by the same filter,
+which keeps s and removes the noise of the depths. A person who moves with the camera looks like a small s:
+bounds from the scene's depth keep the background behind the person.
 """
 
 from __future__ import annotations

@@ -157,13 +157,7 @@ class Appearance:
 
 
 def make_appearance(body: BodyModel, landmarks: Landmarks, seed: int) -> Appearance:
-    """The look of a person; equal seeds give equal looks.
-
-    Args:
-        body: the body.
-        landmarks: where the face's features are.
-        seed: the identity's.
-    """
+    """The look of a person; equal seeds give equal looks. ``landmarks`` place the face's features."""
     measures, style = measure(body), make_style(seed)
     chest, back = paint_print(measures, style)
     face = paint_face(body, landmarks, measures, style)

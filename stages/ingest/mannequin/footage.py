@@ -1,4 +1,4 @@
-"""The clip of a mannequin: in memory, or written as the ingest stage publishes it with the truth beside it."""
+"""The clip of a mannequin in memory, or written as the ingest stage publishes it with its truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.framing import frame_motion, unseen_camera
 from stages.ingest.mannequin.motion import make_motion
 from stages.ingest.mannequin.person import make_identity
-from stages.ingest.mannequin.scene import RenderedFrame, Scene, film, make_background, make_scene
+from stages.ingest.mannequin.scene import FilmedFrame, Scene, film, make_background, make_scene
 from stages.ingest.mannequin.simulated_detector import simulate_detections
 from stages.ingest.mannequin.spec import VIEWS, MannequinSpec, mannequin_spec
 from stages.ingest.mannequin.truth import BodyPoints, Truth, point_states, pose_points, write_truth
@@ -33,19 +33,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Mannequin:
-    """A clip with its truth.
+    """A clip with its truth, and the scene that was filmed, for further cameras."""
 
-    Attributes:
-        frames: [T, H, W, 3] uint8 RGB.
-        masks: [T, H, W] uint8.
-        keypoints: what the detector says.
-        cameras: frame number -> the pipeline's camera.
-        truth: what is known.
-        scene: what was filmed, for further cameras.
-    """
-
-    frames: np.ndarray
-    masks: np.ndarray
+    frames: np.ndarray  # [T, H, W, 3] uint8 RGB
+    masks: np.ndarray  # [T, H, W] uint8
     keypoints: Keypoints
     cameras: dict[int, Camera]
     truth: Truth
@@ -58,7 +49,8 @@ class Filming:
     Attributes:
         spec: what is filmed.
         scene: bodies and cameras.
-        places: where joints and landmarks are.
+        places: the places of joints and landmarks.
+        point_states: [T, K] uint8, their states, known once all the pictures have been taken.
     """
 
     def __init__(self, spec: MannequinSpec, body: BodyModel, landmarks: Landmarks) -> None:
@@ -79,40 +71,33 @@ class Filming:
         self.identity = identity
         self.scene = make_scene(body, clothed, appearance, shot, spec.seed)
         self.places: BodyPoints = pose_points(body, landmarks, identity, shot.poses)
-        self._state = np.zeros(self.places.world.shape[:2], np.uint8)
+        self.point_states = np.zeros(self.places.world.shape[:2], np.uint8)
 
-    def pictures(self) -> Iterator[RenderedFrame]:
-        """The pipeline's frames in order; what is seen of the body in each is noted on the way."""
+    def pictures(self) -> Iterator[FilmedFrame]:
+        """The pipeline's frames in order; the states of the body's points are kept on the way."""
         camera = self.scene.shot.camera
         background = make_background(camera, self.spec.seed)
         for row in range(self.spec.frames):
             picture = film(self.scene, row, camera, background)
-            self._state[row] = point_states(camera, picture, self.places, row)
+            self.point_states[row] = point_states(camera, picture, self.places, row)
             yield picture
-
-    @property
-    def point_states(self) -> np.ndarray:
-        """[T, K] uint8, of every point of ``places``; known once all the pictures have been taken."""
-        return self._state
 
     def finish(self) -> tuple[Keypoints, Truth]:
         """Keypoints and truth, once all the pictures have been taken."""
         camera, places = self.scene.shot.camera, self.places
-        keypoints = simulate_detections(self.spec, camera, places, self._state)
+        keypoints = simulate_detections(self.spec, camera, places, self.point_states)
         joints, points = places.sets["joints"], places.sets["whole_body"]
         truth = Truth(
-            identity=self.identity,
-            surface=self.scene.clothed,
-            poses=self.scene.shot.poses,
+            self.identity, self.scene.clothed, self.scene.shot.poses,
             joints=places.world[:, joints].numpy(),
-            joint_state=self._state[:, joints],
+            joint_state=self.point_states[:, joints],
             keypoints=project(camera, places.world[:, points]).numpy(),
-            keypoint_state=self._state[:, points],
-        )
+            keypoint_state=self.point_states[:, points],
+        )  # fmt: skip
         return keypoints, truth
 
 
-def film_view(spec: MannequinSpec, scene: Scene, name: str) -> Iterator[tuple[int, Camera, RenderedFrame]]:
+def film_view(spec: MannequinSpec, scene: Scene, name: str) -> Iterator[tuple[int, Camera, FilmedFrame]]:
     """The frames of a camera that the pipeline never sees: frame number, camera, picture."""
     camera = unseen_camera(scene.shot, name)
     background = make_background(camera, spec.seed + 1 + list(VIEWS).index(name))
@@ -121,16 +106,7 @@ def film_view(spec: MannequinSpec, scene: Scene, name: str) -> Iterator[tuple[in
 
 
 def make_mannequin(spec: MannequinSpec, body: BodyModel, landmarks: Landmarks) -> Mannequin:
-    """Film a whole clip in memory.
-
-    Args:
-        spec: what is filmed.
-        body: the body, as by ``pipeline.body.load_body``.
-        landmarks: as by ``pipeline.body.load_landmarks``.
-
-    Raises:
-        UserError: the motion's BVH file cannot be used.
-    """
+    """A whole clip filmed in memory; UserError where the motion's BVH file cannot be used."""
     filming = Filming(spec, body, landmarks)
     pictures = list(filming.pictures())
     keypoints, truth = filming.finish()
@@ -207,7 +183,7 @@ def describe(spec: MannequinSpec) -> Footage:
     )
 
 
-def _write(folder: Path, row: int, picture: RenderedFrame) -> None:
+def _write(folder: Path, row: int, picture: FilmedFrame) -> None:
     for kind in ("frames", "masks"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     write_frame(folder / "frames", row, picture.image)

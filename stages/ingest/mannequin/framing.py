@@ -48,11 +48,7 @@ def frame_motion(
     ``full`` shows the whole body in every frame, ``upper`` what is above the waist, ``head`` what is
     above the collarbones; hands may leave the picture in the latter two.
 
-    Args:
-        spec: framing and size are read.
-        body: the body.
-        identity: with clothes and hair.
-        motion: what it does.
+    Framing and size of ``spec`` are read; ``identity`` is with clothes and hair.
     """
     camera = facing_camera(spec.size, spec.size, FOCAL[spec.framing] * spec.size)
     root = motion.root * torch.tensor(WANDERING[spec.framing])

@@ -73,9 +73,8 @@ def make_motion(
 
     Args:
         spec: motion, frames, fps and seed are read.
-        joints: [55, 3], the body's rest joints.
-        parents: its kinematic tree.
-        expressions: E, how many expression parameters the body has.
+        joints, parents: the body's rest joints [55, 3] and its kinematic tree.
+        expressions: E, the number of the body's expression parameters.
 
     Raises:
         UserError: the BVH file is missing or cannot be used.

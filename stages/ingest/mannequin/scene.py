@@ -38,7 +38,7 @@ _OF_PART = np.array([_LIMBS.get(part, 0) for part in PARTS], np.int8)
 
 
 @dataclasses.dataclass(frozen=True)
-class RenderedFrame:
+class FilmedFrame:
     """One frame as a camera sees it.
 
     Attributes:
@@ -59,10 +59,7 @@ class Scene:
     """The clothed body, its motion and its looks.
 
     Attributes:
-        body: the body.
         clothed: the person, hair and clothes included as offsets of the template.
-        appearance: colours.
-        shot: cameras and motion.
         seed: of background and grain.
         rest: [V, 3], the clothed surface in T pose without expression.
         transforms: [T, 55, 3, 4], of the joints.
@@ -112,15 +109,8 @@ def make_scene(
     return Scene(body, clothed, appearance, shot, seed, rest, transforms, limbs)
 
 
-def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> RenderedFrame:
-    """One frame of one camera.
-
-    Args:
-        scene: what is filmed.
-        row: the frame.
-        camera: the view.
-        background: [H, W, 3] float32, as by ``make_background``.
-    """
+def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> FilmedFrame:
+    """One frame of one camera before a ``background`` [H, W, 3] float32, as by :func:`make_background`."""
     size = (camera.width, camera.height)
     vertices, faces = scene.vertices(row), scene.body.faces
     fine = camera.resized(size[0] * SAMPLES, size[1] * SAMPLES)
@@ -141,7 +131,7 @@ def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> Rend
     image = pixels[..., :3] + (1 - pixels[..., 3:]) * background
     grain = np.random.default_rng([scene.seed, 5, row]).standard_normal(image.shape, np.float32)
     image = np.clip(np.round(image + GRAIN * grain), 0, 255).astype(np.uint8)
-    return RenderedFrame(image, np.round(pixels[..., 3] * 255).astype(np.uint8), raster.depth, limb)
+    return FilmedFrame(image, np.round(pixels[..., 3] * 255).astype(np.uint8), raster.depth, limb)
 
 
 def make_background(camera: Camera, seed: int) -> np.ndarray:

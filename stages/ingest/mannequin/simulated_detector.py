@@ -154,7 +154,7 @@ def simulate_detections(
     found.whole_body[:, FACE] = face[..., [0, 1, 3]]
     found.whole_body[:, LEFT_HAND] = found.hands[:, 0][..., [0, 1, 3]]
     found.whole_body[:, RIGHT_HAND] = found.hands[:, 1][..., [0, 1, 3]]
-    if detector.in_picture:
+    if detector.keeps_inside:
         blank = empty_keypoints(found.frames)
         return dataclasses.replace(blank, whole_body=found.whole_body)
     found.whole_body[~in_picture(camera, found.whole_body[..., :2])] = 0  # as the ingest stage writes them
@@ -162,11 +162,11 @@ def simulate_detections(
 
 
 class _Detector:
-    """A detector with its random draws; ``in_picture`` is true where it puts every point inside the picture."""
+    """A detector with its random draws; with ``keeps_inside`` it puts every point inside the picture."""
 
     def __init__(self, spec: MannequinSpec, camera: Camera) -> None:
         self.spec, self.camera = spec, camera
-        self.in_picture = spec.detector == "heatmap"
+        self.keeps_inside = spec.detector == "heatmap"
         self.size = np.array([camera.width, camera.height], float)
         self.focal = float(camera.intrinsics[0, 0])
         self.rng = np.random.default_rng([spec.seed, 7])
@@ -184,7 +184,7 @@ class _Detector:
 
     def as_a_whole(self, truth: _TruePoints) -> _TruePoints:
         """A hand or face as a model of its own sees it: found with its points outside, or not at all."""
-        if self.in_picture:
+        if self.keeps_inside:
             return truth
         return dataclasses.replace(truth, state=np.maximum(truth.state, HIDDEN))
 
@@ -200,7 +200,7 @@ class _Detector:
         outside = (truth.state == OUTSIDE)[..., None]
         off = np.where(outside, self._guessed(away, parts), self._found(truth, parts))
         xy = truth.pixels + off * per_metre[..., None]
-        if self.in_picture:
+        if self.keeps_inside:
             seen = (truth.state == SEEN)[..., None]
             xy = np.where(seen, np.clip(xy, 0, self.size), self._pulled_in(xy))
         depth = truth.camera[..., 2] - truth.camera[..., 2].mean(1, keepdims=True)
@@ -237,7 +237,7 @@ class _Detector:
 
         A detector that has to return something somewhere scores it low; the other returns nothing.
         """
-        if self.in_picture:
+        if self.keeps_inside:
             points[missed, :, 3] = np.minimum(points[missed, :, 3], 0.2)
         else:
             points[missed] = 0

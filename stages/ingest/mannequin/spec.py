@@ -14,7 +14,7 @@ from pipeline.config.settings import SETTINGS, Count, Fraction, FrameRate, Seed,
 Framing = Literal["full", "upper", "head"]
 Detector = Literal["mediapipe", "heatmap"]
 UnseenView = Literal["left", "right", "back", "above"]
-FilmedFrames = Annotated[int, Field(ge=2, le=1_000_000)]
+FrameCount = Annotated[int, Field(ge=2, le=1_000_000)]
 Noise = Annotated[float, Field(ge=0, le=100)]
 
 FRAMINGS: tuple[Framing, ...] = get_args(Framing)
@@ -67,7 +67,7 @@ class MannequinSpec:
 
     framing: Framing = "full"
     motion: str = ""
-    frames: FilmedFrames = 60
+    frames: FrameCount = 60
     size: Side = 256
     fps: FrameRate = 25.0
     seed: Seed = 0

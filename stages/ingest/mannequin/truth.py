@@ -42,7 +42,7 @@ from pipeline.body.landmarks import join
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.files.tables import read_table, vectors, write_table
 from stages.ingest.mannequin.framing import in_picture
-from stages.ingest.mannequin.scene import RenderedFrame, limbs_of_joints
+from stages.ingest.mannequin.scene import FilmedFrame, limbs_of_joints
 
 OUTSIDE, HIDDEN, SEEN = 0, 1, 2
 """States of a point: not in the picture, behind something, or in view."""
@@ -144,14 +144,12 @@ def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple
     return posed_joints(rotation, joints, part.parents) + shift, vertices + shift
 
 
-def point_states(camera: Camera, picture: RenderedFrame, places: BodyPoints, row: int) -> np.ndarray:
+def point_states(camera: Camera, picture: FilmedFrame, places: BodyPoints, row: int) -> np.ndarray:
     """The state of each joint and landmark in one frame, [K] uint8: OUTSIDE, HIDDEN or SEEN.
 
     Args:
-        camera: the view.
-        picture: what it saw.
-        places: joints and landmarks.
-        row: the frame.
+        camera, picture: the view and what it saw.
+        places, row: joints and landmarks, and the frame.
     """
     points = places.world[row]
     within, rows, columns, away = _samples(camera, picture.depth, points)
@@ -166,8 +164,7 @@ def seen_vertices(
     """True where vertices [V, 3] are in view in one frame, [V] bool.
 
     Args:
-        camera: the view.
-        depth: [h, w], metres, the same view at any resolution; infinite where there is nothing.
+        camera, depth: the view, and its depth [h, w] at any resolution, metres, infinite beside the body.
         vertices: metres, in the world.
         tolerance: how deep below what is seen a vertex may lie, metres; hair and clothes count.
     """
@@ -187,7 +184,7 @@ def _samples(
 
 
 def write_truth(folder: Path, truth: Truth, body: BodyModel) -> None:
-    """Write the files that the module's text names."""
+    """Write the files that the module's docstring lists."""
     write_poses(folder / "truth_poses.parquet", truth.poses)
     write_identity(folder / "truth_identity.safetensors", truth.identity, body)
     write_identity(folder / "truth_surface.safetensors", truth.surface, body)
