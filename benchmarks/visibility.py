@@ -26,7 +26,7 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
-from pipeline.avatar.visibility import evidence_threshold
+from pipeline.avatar.otsu_threshold import evidence_threshold
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError

@@ -5,7 +5,7 @@ That is measured for gated vertices as for all others, by posing the bare body, 
 
 The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
-the captured frames' scores (:mod:`pipeline.avatar.visibility`) and what lies below it is gated: it leaves
+the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
 that a region that comes into view later returns.
 
@@ -30,7 +30,8 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.avatar.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
+from pipeline.avatar.otsu_threshold import Threshold, evidence_threshold, fixed_threshold
+from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import Pose
 from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved

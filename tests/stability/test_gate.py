@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.avatar.visibility import (
+from pipeline.avatar.otsu_threshold import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
