@@ -12,8 +12,7 @@ from pathlib import Path
 
 from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
-from pipeline.error_messages import explain
-from pipeline.errors import UserError
+from pipeline.errors import UserError, explain
 from pipeline.run.job import open_job, run_stage
 from pipeline.run.process import leave_reason
 from pipeline.run.stage import load_stages

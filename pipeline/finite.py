@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.errors import UserError
 
@@ -116,19 +116,3 @@ def _arrays(path: Path) -> Iterable[tuple[str, np.ndarray]]:
     with loaded:
         for name in loaded.files:
             yield name, loaded[name]
-
-
-def not_finite_in(value: Any, place: str = "") -> str | None:
-    """Where JSON content holds a number that is not finite: "means.test.psnr"; None where it holds none."""
-    if isinstance(value, float):
-        return None if math.isfinite(value) else place
-    parts: Iterable[tuple[Any, Any]] = ()
-    if isinstance(value, Mapping):
-        parts = value.items()
-    elif isinstance(value, list | tuple):
-        parts = enumerate(value)
-    for key, part in parts:
-        found = not_finite_in(part, f"{place}.{key}" if place else str(key))
-        if found is not None:
-            return found
-    return None

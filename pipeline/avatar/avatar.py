@@ -17,12 +17,10 @@ from torch import Tensor, nn
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.head import Head
-from pipeline.avatar.nearest_skinning import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.residual import Residuals, regions
-from pipeline.avatar.row_selection import put, take
-from pipeline.avatar.skinning_tables import Rig
-from pipeline.avatar.submesh import active_rows, restricted
-from pipeline.avatar.surface import Surface, build_surface, plane_regions
+from pipeline.avatar.skinning_tables import OWN, Rig, nearest_rows, with_weights_of
+from pipeline.avatar.sparse import gather_rows, scatter_rows
+from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
 from pipeline.avatar.triplane import Triplane
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
 from pipeline.device import autocast, moved
@@ -299,13 +297,13 @@ class Avatar(nn.Module):
         """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
         features, count = decoded.features, len(normals)
         if rows is not None:
-            features, normals = take(features, rows), take(normals, rows)
+            features, normals = gather_rows(features, rows), gather_rows(normals, rows)
         with self._autocast():
             geometry = self.pose_geometry(features, theta)
             color = self.pose_color(torch.cat([features, normals], 1), theta)
         geometry, color = geometry.float(), color.float()
         if rows is not None:
-            geometry, color = put(geometry, rows, count), put(color, rows, count)
+            geometry, color = scatter_rows(geometry, rows, count), scatter_rows(color, rows, count)
         offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
         return offset, 0.5 * geometry[:, 3:], color
 

@@ -27,7 +27,7 @@ from pipeline.body import (
     subdivide,
     vertex_normals,
 )
-from pipeline.body.mouth import close_mouth
+from pipeline.body.mesh import close_mouth
 
 HEAD = ("head", "face")
 HANDS = ("left_hand", "right_hand")

@@ -1,9 +1,9 @@
-"""Otsu's threshold on visibility scores, and the test that it has to pass before anything is gated (Section 3.4).
+"""Otsu's threshold on visibility scores, and the test that it passes before anything is gated (Section 3.4).
 
 A score v_i is the share of the frames that show vertex i (``visibility.py``). The paper's threshold is Otsu's
 tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu finds a
-threshold all the same, and cuts what the clip does show. ``evidence_threshold`` tells the two apart by what is
-lost.
+threshold all the same, and cuts what the clip does show. ``evidence_threshold`` tells the two apart by what
+is lost.
 
 **The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
 frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /

@@ -1,7 +1,7 @@
 """The parts of the body that a frame shows: the counts that visibility scores are made of (Section 3.4).
 
-A score v_i is the share of the frames that show vertex i; ``otsu_threshold.py`` finds the threshold under which
-a vertex is gated.
+A score v_i is the share of the frames that show vertex i; ``otsu_threshold.py`` finds the threshold under
+which a vertex is gated.
 """
 
 from __future__ import annotations

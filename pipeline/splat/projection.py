@@ -154,7 +154,7 @@ def project_forward(
     Args:
         means, quaternions, scales, colors, opacities: as in ``Gaussians``, float32 or float64 alike.
         rotation: float64 [3, 3]; translation: float64 [3].
-        lens: a ``Lens``.
+        lens: a ``Pinhole``.
         tile: a tile's side, pixels.
         records: output [N, RECORD_WIDTH]; rows of Gaussians that are left out stay as they are.
         boxes: output int32 [N, 4], the tiles that a Gaussian can touch: first column, first row, end column,

@@ -1,7 +1,6 @@
 """The clip's colours on the surface of the fitted body: gathered from frames, and painted into a view."""
 
-from pipeline.texture.paint import paint
-from pipeline.texture.projection import Seen, gather, robust_mean, weighted_median
+from pipeline.texture.projection import Seen, gather, paint, robust_mean, weighted_median
 from pipeline.texture.surface import FineSurface, fine_surface
 
 __all__ = [

@@ -23,9 +23,9 @@ import torch
 from pipeline.body import Poses, read_poses, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frames import spread_from_start
 from pipeline.clip.keypoints import COUNT
 from pipeline.clip.records import read_cameras, read_json
-from pipeline.clip.spread import spread_from_start
 from pipeline.errors import UserError
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
 from stages.auxiliary.offer import Offer, Picture

@@ -23,8 +23,8 @@ from pipeline.config.evaluation_protocol import OWN, TRUTH
 from pipeline.finite import require_finite
 from pipeline.metrics.face_identity import Face, identity_cosine, identity_distance
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.person_pixels import interior, person
 from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import interior, person
 from pipeline.metrics.ssim import ssim
 from stages.evaluate.methods import OnBackground
 
@@ -116,7 +116,7 @@ class Scorer:
         Args:
             picture: what is scored.
             truth: the person.
-            interior: [H, W] bool, see :func:`pipeline.metrics.person_pixels.interior`.
+            interior: [H, W] bool, see :func:`pipeline.metrics.regions.interior`.
             person: [H, W] bool, the person's pixels; without ``psnr_person`` if None.
 
         Returns:

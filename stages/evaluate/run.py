@@ -14,10 +14,9 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose
 from pipeline.clip.curves import read_curve
-from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
-from pipeline.clip.spread import spread_end_to_end
 from pipeline.config.settings import as_dict
 from pipeline.metrics import Lpips
 from pipeline.metrics.face_identity import FaceReader

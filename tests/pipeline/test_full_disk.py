@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from pipeline.clip.frames import write_png
-from pipeline.error_messages import explain, is_disk_full, size
+from pipeline.errors import explain, is_disk_full, size
 from pipeline.files.tables import write_table
 from pipeline.run.job import open_job, run_stage
 from pipeline.store.artifact import Store

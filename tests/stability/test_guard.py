@@ -11,8 +11,7 @@ from safetensors.torch import save_file
 
 from pipeline import finite as guard
 from pipeline.body import Poses, write_poses
-from pipeline.error_messages import explain
-from pipeline.errors import UserError
+from pipeline.errors import UserError, explain
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
 from pipeline.finite import NotFiniteError, finite, require_finite, require_finite_files

@@ -11,8 +11,7 @@ from rich.console import Console
 
 from pipeline.body import Pose, Poses, write_poses
 from pipeline.clip.curves import read_curve
-from pipeline.clip.frames import write_mask, write_png
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end, write_mask, write_png
 from pipeline.errors import UserError
 from pipeline.metrics import PSNR_CAP
 from pipeline.orbit_cameras import relaxed_pose

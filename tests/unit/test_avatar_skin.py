@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
-from pipeline.avatar.nearest_skinning import OWN, nearest_rows
+from pipeline.avatar.skinning_tables import OWN, nearest_rows
 from pipeline.body import Pose, load_body, mean_identity
 from pipeline.config.workspace import REPOSITORY
 
