@@ -120,7 +120,7 @@ def megabytes(trainer: Trainer) -> float:
     surface = trainer.avatar.surface()
     with torch.no_grad():
         decoded = trainer.avatar.decode()
-    owners = (surface.canonical, surface.rig, decoded)
+    owners = (surface.canonical, surface.skinning_tables, decoded)
     tensors = [one for owner in owners for one in vars(owner).values() if isinstance(one, torch.Tensor)]
     for pair in (surface.samples, surface.neighbours):
         for matrix in (pair.matrix, pair.transpose):

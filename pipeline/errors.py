@@ -28,7 +28,7 @@ class UserError(Exception):
     """
 
 
-def explain(error: BaseException, where: Path) -> str | None:
+def error_message(error: BaseException, where: Path) -> str | None:
     """The one line that a user is shown for this error, or None if it is a defect of ours.
 
     Args:
@@ -40,7 +40,7 @@ def explain(error: BaseException, where: Path) -> str | None:
     if is_disk_full(error):
         place = named_file(error) or fullest(where, Path(tempfile.gettempdir()))
         return (
-            f"{place}: the disk is full ({room(place)}); free some space or choose another store "
+            f"{place}: the disk is full ({free_space(place)}); free some space or choose another store "
             "(artifacts=FOLDER), then run the same command again"
         )
     if any(isinstance(one, OSError) and one.errno in READ_ONLY for one in chain(error)):
@@ -95,13 +95,13 @@ def existing(path: Path) -> Path:
     return next(one for one in (path, *path.absolute().parents) if one.exists())
 
 
-def room(path: Path) -> str:
+def free_space(path: Path) -> str:
     """How much room the disk of a path has."""
     usage = shutil.disk_usage(existing(path))
-    return f"{size(usage.free)} of {size(usage.total)} free"
+    return f"{readable_size(usage.free)} of {readable_size(usage.total)} free"
 
 
-def size(count: float) -> str:
+def readable_size(count: float) -> str:
     """A number of bytes for people."""
     for unit in ("bytes", "KiB", "MiB", "GiB"):
         if count < 1024 or unit == "GiB":

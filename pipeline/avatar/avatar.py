@@ -18,7 +18,7 @@ from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.head import Head
 from pipeline.avatar.residual import Residuals, regions
-from pipeline.avatar.skinning_tables import OWN, Rig, nearest_rows, with_weights_of
+from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
 from pipeline.avatar.sparse import gather_rows, scatter_rows
 from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
 from pipeline.avatar.triplane import Triplane
@@ -76,11 +76,11 @@ class Avatar(nn.Module):
 
     Attributes:
         architecture: sizes.
-        kept: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
+        vertex_ids: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
         identity: the fitted identity; on the CPU, too.
         body_digest: of the body model that it was built on.
         surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
-        active: [K] bool, the kept vertices that the visibility gate leaves; see ``surface``.
+        active: [K] bool, these vertices that the visibility gate leaves; see ``surface``.
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
@@ -96,7 +96,7 @@ class Avatar(nn.Module):
         self,
         body: BodyModel,
         identity: Identity,
-        kept: Tensor,  # [K]
+        vertex_ids: Tensor,  # [K]
         architecture: Architecture,
         seed: int = 0,
         half_precision: bool = True,
@@ -106,17 +106,18 @@ class Avatar(nn.Module):
         Args:
             body: the body model.
             identity: the subject's identity.
-            kept: [K] int64, the body vertices that carry Gaussians, sorted.
+            vertex_ids: [K] int64, the body vertices that carry Gaussians, sorted.
             architecture: sizes.
             seed: of the initial weights.
             half_precision: whether the heads run in bfloat16.
         """
         super().__init__()
-        self.architecture, self.kept, self.identity = architecture, kept, identity
+        self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
         meshes = [
-            build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
+            build_canonical(body, identity, level, vertex_ids)
+            for level in range(architecture.subdivisions + 1)
         ]
         planes, self.boxes = plane_regions(meshes[-1])
         residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
@@ -125,7 +126,7 @@ class Avatar(nn.Module):
             for mesh, parts in zip(meshes, residual, strict=True)
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
-        self.register_buffer("active", torch.ones(len(kept), dtype=torch.bool))
+        self.register_buffer("active", torch.ones(len(vertex_ids), dtype=torch.bool))
         self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
@@ -177,7 +178,7 @@ class Avatar(nn.Module):
         return self
 
     def gate(self, active: Tensor) -> None:
-        """Leaves only some of the kept vertices; others may come back with a later call.
+        """Leaves only some of the vertices; others may come back with a later call.
 
         Args:
             active: [K] bool, with at least one.
@@ -206,7 +207,7 @@ class Avatar(nn.Module):
         """Gives points off head and hands the skinning weights of the vertex that they now lie nearest."""
         decoded = self.decode()
         points = decoded.surface.canonical.vertices + decoded.offset
-        free = decoded.surface.pliable[:, 0] > 0
+        free = decoded.surface.pose_movable[:, 0] > 0
         rows = nearest_rows(points, self.surfaces[0].canonical.vertices, free)
         places = decoded.surface.pick(torch.arange(len(self.skin_rows), device=self.device))
         self.skin_rows.index_copy_(0, places, rows)
@@ -217,7 +218,9 @@ class Avatar(nn.Module):
         original = self._own_surfaces[0].canonical
         for level, own in enumerate(self._own_surfaces):
             mesh = with_weights_of(own.canonical, original, self.skin_rows[: len(own.canonical)])
-            self.surfaces[level] = dataclasses.replace(own, canonical=mesh, rig=Rig.build(mesh))
+            self.surfaces[level] = dataclasses.replace(
+                own, canonical=mesh, skinning_tables=SkinningTables.build(mesh)
+            )
         self._restricted.clear()
         self._baked = None
 
@@ -272,7 +275,7 @@ class Avatar(nn.Module):
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
-            normals = decoded.surface.rig.normals(transforms, shape)
+            normals = decoded.surface.skinning_tables.normals(transforms, shape)
             pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
@@ -284,7 +287,7 @@ class Avatar(nn.Module):
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
-            quaternions=decoded.surface.rig.place(transforms, shape, pose.transl)[1],
+            quaternions=decoded.surface.skinning_tables.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, log_scale),
             colors=torch.sigmoid(color_logit),
             opacities=self._opacities(canonical),
@@ -304,7 +307,7 @@ class Avatar(nn.Module):
         geometry, color = geometry.float(), color.float()
         if rows is not None:
             geometry, color = scatter_rows(geometry, rows, count), scatter_rows(color, rows, count)
-        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
+        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pose_movable
         return offset, 0.5 * geometry[:, 3:], color
 
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
@@ -347,10 +350,10 @@ class Avatar(nn.Module):
         seen = self.pose(self._baked, pose, time=time, theta=theta).gaussians
         if self.unseen == "nothing" or bool(self.active.all()):
             return seen
-        bare = self.bare(self.unseen_surface(), pose)
+        bare = self.base_gaussians(self.unseen_surface(), pose)
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
-    def bare(self, surface: Surface, pose: Pose) -> Gaussians:
+    def base_gaussians(self, surface: Surface, pose: Pose) -> Gaussians:
         """The fitted body in its base colours, in a pose: what no network has a say in.
 
         Args:
@@ -363,7 +366,7 @@ class Avatar(nn.Module):
         shape = _rest_shape(canonical, pose)
         return Gaussians(
             means=transform_points(blended, shape) + pose.transl,
-            quaternions=surface.rig.place(transforms, shape, pose.transl)[1],
+            quaternions=surface.skinning_tables.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
             colors=torch.sigmoid(surface.pick(self.base_color)),
             opacities=self._opacities(canonical),

@@ -45,7 +45,7 @@ def faces_of_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rig:
+class SkinningTables:
     """What skinning needs of a canonical mesh; all tensors are contiguous, floating ones float32.
 
     Attributes:
@@ -63,7 +63,7 @@ class Rig:
     around: Tensor
 
     @classmethod
-    def build(cls, canonical: Canonical) -> Rig:
+    def build(cls, canonical: Canonical) -> SkinningTables:
         """The rig of a mesh."""
         joints_of, weights = joints_of_points(canonical.skinning_weights)
         starts, around = faces_of_vertices(canonical.faces, len(canonical))
@@ -112,24 +112,26 @@ class Rig:
 
 
 @torch.no_grad()
-def plain_normals(rig: Rig, transforms: Tensor, points: Tensor) -> Tensor:
-    """The plain twin of ``Rig.normals``."""
-    blended = _blended(rig, transforms)
-    return vertex_normals(transform_points(blended, points), rig.faces.long())
+def plain_normals(tables: SkinningTables, transforms: Tensor, points: Tensor) -> Tensor:
+    """The plain twin of ``SkinningTables.normals``."""
+    blended = _blended(tables, transforms)
+    return vertex_normals(transform_points(blended, points), tables.faces.long())
 
 
 @torch.no_grad()
-def plain_place(rig: Rig, transforms: Tensor, points: Tensor, transl: Tensor) -> tuple[Tensor, Tensor]:
-    """The plain twin of ``Rig.place``."""
-    blended = _blended(rig, transforms)
-    quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ rig.frames)
+def plain_place(
+    tables: SkinningTables, transforms: Tensor, points: Tensor, transl: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The plain twin of ``SkinningTables.place``."""
+    blended = _blended(tables, transforms)
+    quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ tables.frames)
     return transform_points(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
 
 
-def _blended(rig: Rig, transforms: Tensor) -> Tensor:
+def _blended(tables: SkinningTables, transforms: Tensor) -> Tensor:
     """The transform that each point is carried with, [N, 3, 4]."""
-    weights = transforms.new_zeros(len(rig.weights), len(transforms))
-    weights.scatter_(1, rig.joints_of.long(), rig.weights.to(weights))
+    weights = transforms.new_zeros(len(tables.weights), len(transforms))
+    weights.scatter_(1, tables.joints_of.long(), tables.weights.to(weights))
     return blend_transforms(transforms, weights)
 
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from pipeline.avatar.canonical import HANDS, HEAD, Canonical, faces_among
 from pipeline.avatar.residual import Region
-from pipeline.avatar.skinning_tables import Rig
+from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.avatar.sparse import SparsePair
-from pipeline.avatar.triplane import normalise, region_boxes, sampling
+from pipeline.avatar.triplane import bounding_boxes, normalise, sampling_matrix
 from pipeline.body import subdivide
 
 
@@ -29,9 +29,9 @@ class Surface:
         canonical: the mesh.
         samples: from texels to the vertices' features.
         neighbours: the mean over each vertex's neighbours.
-        pliable: [N, 1] float, 1 where pose heads may move a vertex: not on head and hands, which
+        pose_movable: [N, 1] float, 1 where pose heads may move a vertex: not on head and hands, which
             follow the body model alone.
-        rig: the mesh as skinning without gradient needs it.
+        skinning_tables: the mesh as skinning without gradient needs it.
         residual: the parts that have a residual colour head.
         rows: [N] int64, which of the level's vertices these are; None where they are all of them.
     """
@@ -39,8 +39,8 @@ class Surface:
     canonical: Canonical
     samples: SparsePair
     neighbours: SparsePair
-    pliable: Tensor  # [N, 1]
-    rig: Rig
+    pose_movable: Tensor  # [N, 1]
+    skinning_tables: SkinningTables
     residual: tuple[Region, ...] = ()
     rows: Tensor | None = None
 
@@ -57,7 +57,7 @@ def plane_regions(finest: Canonical) -> tuple[Tensor, Tensor]:
     head = finest.is_part(*HEAD)
     both = bool(head.any()) and not bool(head.all())
     planes = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
-    return planes, region_boxes(finest.vertices, planes)
+    return planes, bounding_boxes(finest.vertices, planes)
 
 
 def build_surface(
@@ -65,9 +65,9 @@ def build_surface(
 ) -> Surface:
     """The surface of a whole level; see ``plane_regions`` for ``planes`` and ``boxes``."""
     coordinates = normalise(mesh.vertices, planes, boxes)
-    samples = sampling(coordinates, planes, len(boxes), resolution)
-    pliable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
-    return Surface(mesh, samples, mesh.neighbour_mean(), pliable, Rig.build(mesh), residual)
+    samples = sampling_matrix(coordinates, planes, len(boxes), resolution)
+    pose_movable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
+    return Surface(mesh, samples, mesh.neighbour_mean(), pose_movable, SkinningTables.build(mesh), residual)
 
 
 def active_rows(coarse: Canonical, active: Tensor, level: int) -> Tensor:
@@ -112,8 +112,8 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
         canonical=mesh,
         samples=surface.samples.of_rows(features),
         neighbours=surface.neighbours.mean_among(rows),
-        pliable=surface.pliable[rows],
-        rig=Rig.build(mesh),
+        pose_movable=surface.pose_movable[rows],
+        skinning_tables=SkinningTables.build(mesh),
         residual=tuple(
             region for region in (_part(one, place) for one in surface.residual) if len(region.rows)
         ),

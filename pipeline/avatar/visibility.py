@@ -36,4 +36,4 @@ def body_in_frame(surface: Surface, pose: Pose, camera: Camera) -> Tensor:
     """
     canonical = surface.canonical
     transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
-    return in_frame(camera, surface.rig.place(transforms, canonical.vertices, pose.transl)[0])
+    return in_frame(camera, surface.skinning_tables.place(transforms, canonical.vertices, pose.transl)[0])

@@ -97,7 +97,7 @@ def read_split(path: Path) -> Split:
     Raises:
         UserError: missing or malformed, no training frame, or a frame in both parts.
     """
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     parts = {}
     for name in ("train", "test"):
         frames = value.get(name) if isinstance(value, dict) else None
@@ -151,17 +151,8 @@ def write_footage(path: Path, footage: Footage) -> None:
 
 def read_footage(path: Path) -> Footage:
     """Read ``footage.json``; UserError where it is missing or malformed."""
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     names = {field.name for field in dataclasses.fields(Footage)}
     if not isinstance(value, dict) or set(value) != names:
         raise UserError(f"{path}: its fields are not {', '.join(sorted(names))}: {_REMEDY}")
     return Footage(**{**value, "seconds": tuple(value["seconds"])})
-
-
-def read_json(path: Path, remedy: str) -> Any:
-    """Read JSON.
-
-    Raises:
-        UserError: as ``untrusted.parse_json``: missing, too large, no JSON, NaN or an infinity.
-    """
-    return parse_json(path, remedy)

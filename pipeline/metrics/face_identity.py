@@ -30,7 +30,7 @@ _LARGEST_PICTURE = 1200  # pixels of the longer side that the finder is shown
 
 
 @dataclasses.dataclass(frozen=True)
-class Face:
+class RecognizedFace:
     """One found face.
 
     Attributes:
@@ -42,7 +42,7 @@ class Face:
     embedding: np.ndarray
 
 
-class FaceReader:
+class FaceRecognizer:
     """Finds the largest face in a picture and embeds it."""
 
     def __init__(self, dlib_folder: Path, models: Path) -> None:
@@ -64,7 +64,7 @@ class FaceReader:
         self._align = dlib.shape_predictor(str(models / _POINTS))
         self._embed = dlib.face_recognition_model_v1(str(models / _RESNET))
 
-    def read(self, image: np.ndarray, box: Box | None = None) -> Face | None:
+    def read(self, image: np.ndarray, box: Box | None = None) -> RecognizedFace | None:
         """The face in ``image`` [H, W, 3] uint8 RGB, or None where the finder sees none.
 
         Args:
@@ -86,7 +86,7 @@ class FaceReader:
         sides = (face.left(), face.top(), face.right(), face.bottom())
         corner = (left, top, left, top)
         placed = (round(side / scale) + start for side, start in zip(sides, corner, strict=True))
-        return Face(Box(*placed), embedding)
+        return RecognizedFace(Box(*placed), embedding)
 
 
 def identity_distance(first: np.ndarray, second: np.ndarray) -> float:
@@ -103,7 +103,7 @@ def identity_cosine(first: np.ndarray, second: np.ndarray) -> float:
     return float(first @ second / length)
 
 
-def typical(embeddings: list[np.ndarray]) -> np.ndarray:
+def medoid(embeddings: list[np.ndarray]) -> np.ndarray:
     """The embedding with the least summed distance to the others: a real one, robust to a few bad faces.
 
     Raises:

@@ -30,7 +30,7 @@ SURE = 0.02  # summed weight from which a vertex is known; a frontal view at ful
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
+class VertexColors:
     """The clip's colours on the surface.
 
     Attributes:
@@ -47,12 +47,12 @@ class Seen:
 
 
 @torch.no_grad()
-def gather(
+def gather_colors(
     surface: FineSurface,
     clip: FittedClip,
     frames: Sequence[int],
     advance: Callable[[], object] = lambda: None,
-) -> Seen:
+) -> VertexColors:
     """The colours that some frames of a clip show of all vertices.
 
     Args:
@@ -68,17 +68,17 @@ def gather(
     for row, frame in enumerate(frames):
         vertices = clip.vertices(frame)
         pictures = clip.frame(frame), clip.mask(frame)
-        colors[row], weights[row] = look(surface, clip.camera(frame), vertices, *pictures)
+        colors[row], weights[row] = sample_frame(surface, clip.camera(frame), vertices, *pictures)
         normal += surface.refine(vertex_normals(vertices, surface.coarse)).numpy()
         advance()
     largest = weights.max()
     weights /= max(float(largest), 1e-12)
     color = robust_mean(colors, weights)
     weight = weights.sum(0)
-    return Seen(color, weight, weight > SURE, normal / np.float32(max(1, count)))
+    return VertexColors(color, weight, weight > SURE, normal / np.float32(max(1, count)))
 
 
-def look(
+def sample_frame(
     surface: FineSurface,
     camera: Camera,
     vertices: Tensor,  # [V, 3]

@@ -19,7 +19,7 @@ from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
 from pipeline.config.settings import as_dict
 from pipeline.metrics import Lpips
-from pipeline.metrics.face_identity import FaceReader
+from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
 from pipeline.run.job import peak_memory, shown
@@ -101,7 +101,7 @@ def run(context: Context) -> None:
         scorer,
         mesh=mesh,
         second=second_mask(context, clip),
-        embedder=FaceReader(context.assets["dlib"], context.assets["identity"])
+        embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),

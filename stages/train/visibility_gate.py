@@ -83,7 +83,7 @@ class VisibilityGate(nn.Module, Hook):
         """
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
-        for name, shape in (("hits", (2, len(avatar.kept))), ("drawn", (2,))):
+        for name, shape in (("hits", (2, len(avatar.vertex_ids))), ("drawn", (2,))):
             for suffix in ("", "_at_threshold"):
                 counts = torch.zeros(shape, dtype=torch.long, device=avatar.device)
                 self.register_buffer(name + suffix, counts)
@@ -118,7 +118,7 @@ class VisibilityGate(nn.Module, Hook):
     def whole_body(self, values: Tensor) -> np.ndarray:
         """Values of the avatar's vertices, [K], spread over the whole body, [V] float64; elsewhere 0."""
         whole = torch.zeros(self._vertices, dtype=torch.float64)
-        whole[self.avatar.kept] = values.double().cpu()
+        whole[self.avatar.vertex_ids] = values.double().cpu()
         return whole.numpy()
 
     def due(self, iteration: int) -> bool:
@@ -189,7 +189,7 @@ def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: ViewCache, frame
         views: the cameras.
         frames: frame numbers.
     """
-    seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
+    seen = torch.zeros(len(avatar.vertex_ids), dtype=torch.bool, device=avatar.device)
     for frame in frames:
         camera = moved(views.camera(frame), avatar.device)
         seen |= body_in_frame(avatar.surfaces[0], poses.fitted(frame), camera)
