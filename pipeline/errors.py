@@ -57,7 +57,7 @@ def error_message(error: BaseException, where: Path) -> str | None:
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether a full disk or quota is at the bottom of this, whatever library says so."""
+    """True where a full disk or quota caused an error, whatever library raised it."""
     numbers = (one.errno for one in chain(error) if isinstance(one, OSError))
     return any(number in FULL for number in numbers) or any(
         FULL_WORDS.search(str(one)) for one in chain(error)
@@ -65,7 +65,7 @@ def is_disk_full(error: BaseException) -> bool:
 
 
 def chain(error: BaseException) -> Iterator[BaseException]:
-    """An error and those that it came from."""
+    """An error and its causes, at most twenty."""
     one: BaseException | None = error
     for _ in range(20):
         if one is None:
@@ -96,7 +96,7 @@ def existing(path: Path) -> Path:
 
 
 def free_space(path: Path) -> str:
-    """How much room the disk of a path has."""
+    """The free and the whole space of the disk of a path, for people."""
     usage = shutil.disk_usage(existing(path))
     return f"{readable_size(usage.free)} of {readable_size(usage.total)} free"
 

@@ -52,7 +52,7 @@ def require_finite(tensors: Mapping[str, Tensor], who: str, where: str, remedy: 
 
 
 def finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether the tensors add up to a finite number, which says that every number in them is finite.
+    """True where the tensors add up to a finite number; then every number in them is finite.
 
     False says only that one may not be: large numbers overflow together.
     """
@@ -64,7 +64,7 @@ def finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def described(tensor: Tensor) -> str:
-    """How many numbers of a tensor are not finite, and which is the first of them."""
+    """A text that says how many numbers of a tensor are not finite, and names the first."""
     bad = ~tensor.detach().isfinite()
     place = bad.nonzero()[0].tolist()
     value = float(tensor[tuple(place)])
@@ -73,7 +73,7 @@ def described(tensor: Tensor) -> str:
 
 
 def rows_not_finite(tensor: Tensor) -> list[int]:
-    """Which rows of a tensor [T, ...] hold a number that is not finite."""
+    """The rows of a tensor [T, ...] that hold a number that is not finite."""
     return [int(row) for row in (~tensor.detach().isfinite()).flatten(1).any(1).nonzero()[:, 0]]
 
 

@@ -1,4 +1,4 @@
-"""The canonical triplane avatar and what it looks like in a pose (the paper's Sections 3.3, 3.5 and 3.6).
+"""The canonical triplane avatar, and its Gaussians in a pose (the paper's Sections 3.3, 3.5 and 3.6).
 
 Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads + residual
 colours of face and hands -> plus expression -> linear blend skinning -> Gaussians. The part before
@@ -32,7 +32,7 @@ LARGEST_SCALE = 0.03  # metres
 
 @dataclasses.dataclass(frozen=True)
 class Decoded:
-    """What does not depend on the pose.
+    """The part of an avatar that does not depend on the pose.
 
     Attributes:
         surface: the level that was decoded.
@@ -85,7 +85,7 @@ class Avatar(nn.Module):
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
-        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``skin.py``.
+        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
     """
 
     base_color: Tensor
@@ -164,11 +164,11 @@ class Avatar(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its weights and surfaces are."""
+        """The device of its weights and surfaces."""
         return self.active.device
 
     def to(self, device: torch.device | str) -> Avatar:  # type: ignore[override]
-        """Moves weights and surfaces; what they are of is not for changing."""
+        """Moves weights and surfaces; their dtypes stay."""
         if torch.device(device) == self.device:
             return self
         super().to(device)
@@ -225,7 +225,7 @@ class Avatar(nn.Module):
         self._baked = None
 
     def train(self, mode: bool = True) -> Avatar:
-        """As of ``nn.Module``; forgets what was decoded, since weights are about to change."""
+        """Sets the mode as ``nn.Module`` does, and forgets what was decoded: weights are about to change."""
         self._baked = None
         return super().train(mode)
 
@@ -261,11 +261,11 @@ class Avatar(nn.Module):
         Args:
             decoded: the pose-independent part.
             pose: of the frame.
-            noise: added to what the heads are told of the pose; for training.
+            noise: added to theta; for training.
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
-            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are asked for;
-                all if None.
-            theta: what the heads are told of the pose, see ``pose_features``; that of ``pose`` if None.
+            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are evaluated
+                for; all if None.
+            theta: the heads' pose condition, see ``pose_features``; that of ``pose`` if None.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
@@ -342,7 +342,7 @@ class Avatar(nn.Module):
             time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
                 the training frames' interval; None, as for a motion that was never filmed, gives what
                 the heads learnt to answer without a clock (see ``residual.py``).
-            theta: what the heads are told of the pose; that of ``pose`` if None.
+            theta: the heads' pose condition; that of ``pose`` if None.
         """
         if self._baked is None:
             with torch.no_grad():
@@ -354,7 +354,7 @@ class Avatar(nn.Module):
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
     def base_gaussians(self, surface: Surface, pose: Pose) -> Gaussians:
-        """The fitted body in its base colours, in a pose: what no network has a say in.
+        """The fitted body in its base colours, in a pose; no network takes part.
 
         Args:
             surface: which of its vertices.
@@ -373,7 +373,7 @@ class Avatar(nn.Module):
         )
 
     def unseen_surface(self) -> Surface:
-        """What the gate took from the finest level; only where it took something."""
+        """The vertices of the finest level that the gate took; to be called only where it took some."""
         known = self._restricted.get(-1)
         if known is None or not torch.equal(known[0], self.active):
             left = self.surface().rows

@@ -1,4 +1,4 @@
-"""A finished avatar with everything that does not depend on the pose computed once and for all.
+"""A finished avatar whose pose-independent part is computed once and for all.
 
 ``Avatar.gaussians`` decodes the static part once, too. Baking goes on from there: the features are gone, and
 in their place stands what the first layer of each pose head makes of them, ``W_f f_i + b``; static offsets
@@ -31,7 +31,7 @@ class BakedHead:
         products: [N, C], ``W_f f_i + b``, in the precision that the head runs in.
         condition: [C, P] float32, what the shared vector is multiplied with.
         own: [E, C] float32, what a point's own further inputs are multiplied with.
-        layers: the others, arranged (see ``fused.py``).
+        layers: the others, arranged (see ``fused_head.py``).
     """
 
     products: Tensor  # [N, C]
@@ -60,7 +60,7 @@ class BakedResidual:
 
 @dataclasses.dataclass(frozen=True)
 class Constants:
-    """What every pose needs of the body and of the static heads.
+    """The constants of body and static heads that every pose needs.
 
     Attributes:
         points: [N, 3], rest vertices and static offsets, metres.
@@ -130,7 +130,7 @@ class BakedAvatar:
         Args:
             pose: of the body, in the world.
             time: seconds from the clip's start, or None, for the residual colours.
-            theta: what the heads are told of the pose; that of ``pose`` if None.
+            theta: the heads' pose condition; that of ``pose`` if None.
         """
         constants, theta = self.constants, pose_features(pose.rotation) if theta is None else theta
         transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
@@ -170,7 +170,7 @@ class BakedAvatar:
         return points + (constants.correctives @ turned.to(constants.correctives.dtype)).float()
 
     def _residuals(self, means: Tensor, theta: Tensor, time: float | None) -> list[tuple[Tensor, Tensor]]:
-        """Each part's rows and what its head says of them, [M, 3] logits or [M, 6] with moves."""
+        """Each part's rows and its head's output, [M, 3] logits or [M, 6] with moves."""
         if not self.residuals:
             return []
         condition = torch.cat([time_code(time, self.time_range, self.time_frequencies), theta])

@@ -36,7 +36,7 @@ SMALLEST_SPACING, LARGEST_SPACING = 1e-3, 0.05  # metres; a guard against sliver
 
 @dataclasses.dataclass(frozen=True)
 class Canonical:
-    """The Gaussians' home.
+    """The canonical mesh of one level of subdivision; each vertex carries a Gaussian.
 
     Attributes:
         vertices: [N, 3], metres.
@@ -156,7 +156,7 @@ def tangent_frames(normals: Tensor) -> Tensor:
 
 
 def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
-    """How far each vertex's neighbours lie along its two tangents, [N, 2], metres, within sane bounds.
+    """The distance of each vertex's neighbours along its two tangents, [N, 2], metres, clamped.
 
     ``sqrt(2 mean (e . t)^2)`` over the edges e at the vertex: the edge length where triangles are
     regular, and more along than across where they are long and thin. Round Gaussians of the mean

@@ -1,6 +1,6 @@
 """A whole decoding head at once on a CPU: linear layers with GroupNorm and ReLU between, and their gradient.
 
-``heads.Head`` says what is computed, layer by layer. Three things make the same cheaper here.
+``head.Head`` says what is computed, layer by layer. Three things make the same cheaper here.
 
 - GroupNorm subtracts each group's mean, which is linear. So the mean is taken out of the weights before the
   layer (a matrix of 128 x 128) and not out of its output (one of N x 128); what is left of the norm is a
@@ -76,7 +76,7 @@ class HeadParameters:
 
 
 def decode(points: Tensor, layers: HeadParameters, dtype: torch.dtype) -> Tensor:
-    """The head's output for every row: [N, in] -> [N, out] of dtype ``dtype``, differentiable.
+    """The head's output for every row: [N, in] -> [N, out] in ``dtype``, differentiable.
 
     Args:
         points: [N, in].
@@ -90,7 +90,7 @@ def decode(points: Tensor, layers: HeadParameters, dtype: torch.dtype) -> Tensor
 
 
 def arranged(layers: HeadParameters, dtype: torch.dtype) -> HeadParameters:
-    """The same head with centred weights and interleaved groups, its products' weights of dtype ``dtype``."""
+    """The same head with centred weights and interleaved groups, its products' weights in ``dtype``."""
     groups, last = layers.groups, len(layers.weights) - 1
     order = _order(len(layers.biases[0]), groups)
     weights, biases = [], []
@@ -106,7 +106,7 @@ def arranged(layers: HeadParameters, dtype: torch.dtype) -> HeadParameters:
 
 
 def arranged_rows(values: Tensor, groups: int) -> Tensor:
-    """What a further input of the first layer is multiplied with: [C, ...] centred and interleaved."""
+    """Weights of a further input of the first layer, centred and interleaved: [C, ...]."""
     return _centred(values.detach(), groups)[_order(len(values), groups)]
 
 

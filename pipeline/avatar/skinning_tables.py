@@ -46,7 +46,7 @@ def faces_of_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 @dataclasses.dataclass(frozen=True)
 class SkinningTables:
-    """What skinning needs of a canonical mesh; all tensors are contiguous, floating ones float32.
+    """The tables that skinning of a canonical mesh reads; all contiguous, floating ones float32.
 
     Attributes:
         joints_of, weights: [N, K] uint8 and float32, see ``joints_of_points``.
@@ -64,7 +64,7 @@ class SkinningTables:
 
     @classmethod
     def build(cls, canonical: Canonical) -> SkinningTables:
-        """The rig of a mesh."""
+        """The tables of a mesh."""
         joints_of, weights = joints_of_points(canonical.skinning_weights)
         starts, around = faces_of_vertices(canonical.faces, len(canonical))
         faces = canonical.faces.int().contiguous()

@@ -17,7 +17,7 @@ _NEAREST = 0.01  # metres; triangles that reach nearer to the camera are not dra
 
 @dataclasses.dataclass(frozen=True)
 class Raster:
-    """Which point of a mesh each pixel sees.
+    """The point of a mesh that each pixel sees.
 
     Attributes:
         face: [H, W] int32, -1 where there is none.
@@ -31,7 +31,7 @@ class Raster:
 
     @property
     def covered(self) -> np.ndarray:
-        """[H, W] bool: whether the pixel sees the mesh."""
+        """[H, W] bool, true where the pixel sees the mesh."""
         return self.face >= 0
 
     def interpolate(self, faces: np.ndarray, attribute: np.ndarray) -> np.ndarray:

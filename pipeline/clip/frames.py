@@ -24,7 +24,7 @@ Item = TypeVar("Item")
 
 
 def frame_path(folder: Path, index: int) -> Path:
-    """Where frame or mask number ``index`` lies."""
+    """The file of frame or mask number ``index``."""
     return folder / f"{index:06d}.png"
 
 

@@ -38,7 +38,7 @@ DECIDED = (
 """Decided by the plan stage, which has a setting (``on``, ``off`` or ``auto``) of each name."""
 
 SEEN_PARTS = tuple(f"seen_{part}" for part in get_args(BodyPart))
-"""Whether a part of the body is ever seen; measured as the share of training frames that show it."""
+"""One for each part of the body: is it ever seen? Measured as the share of training frames that show it."""
 
 EFFECTS = (*GATHERED, *DECIDED, *SEEN_PARTS)
 
@@ -103,7 +103,7 @@ class Plan:
         raise KeyError(effect)
 
     def on(self, effect: str) -> bool:
-        """Whether an effect is built."""
+        """True where an effect is built."""
         return self[effect].on
 
 

@@ -1,4 +1,4 @@
-"""The small records that travel between the stages: cameras, the split, what the footage was.
+"""The small records that travel between the stages: cameras, the split, the footage.
 
 ``cameras.parquet`` has one row a kept frame: ``frame``, ``width``, ``height`` (int32, pixels),
 ``intrinsics`` [9] and ``rotation`` [9] (float64, row by row) and ``translation`` [3] (float64, metres),
@@ -80,7 +80,7 @@ def read_cameras(path: Path, dtype: torch.dtype = torch.float32) -> dict[int, Ca
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Which frames are learnt from and which are held out; frame numbers, increasing, disjoint."""
+    """The frames to learn from and those held out; frame numbers, increasing, disjoint."""
 
     train: tuple[int, ...]
     test: tuple[int, ...]
@@ -112,7 +112,7 @@ def read_split(path: Path) -> Split:
 
 @dataclasses.dataclass(frozen=True)
 class Footage:
-    """What the source was and what was kept of it.
+    """The source and the frames that were kept of it.
 
     Attributes:
         name: the source's file or folder name.

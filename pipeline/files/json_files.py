@@ -32,7 +32,7 @@ def json_text(value: Any) -> str:
 
 
 def _not_finite_in(value: Any, place: str = "") -> str | None:
-    """Where JSON content holds a number that is not finite: "means.test.psnr"; None where it holds none."""
+    """The place of the first number in JSON content that is not finite, as "means.test.psnr"; else None."""
     if isinstance(value, float):
         return None if math.isfinite(value) else place
     parts: Iterable[tuple[Any, Any]] = ()

@@ -1,4 +1,4 @@
-"""How alike two images are: the only definition of each number that the project reports.
+"""The image metrics: the only definition of each number that the project reports.
 
 Images are float tensors [H, W, 3] with values in [0, 1]; masks are [H, W]. Which pixels
 count is in :mod:`pipeline.metrics.regions`, compositing in :mod:`pipeline.clip.composite`.

@@ -1,4 +1,4 @@
-"""Whose face it is: dlib's 128-number embedding (the paper's face consistency, supplement E.2).
+"""Recognition of faces by dlib's 128-number embedding (the paper's face consistency, supplement E.2).
 
 The paper compares ArcFace embeddings; dlib's stands in for it, since its weights can be had. Two faces
 of one person lie at most about 0.5 apart and those of two people at least about 0.66; cosines are
@@ -31,7 +31,7 @@ _LARGEST_PICTURE = 1200  # pixels of the longer side that the finder is shown
 
 @dataclasses.dataclass(frozen=True)
 class RecognizedFace:
-    """One found face.
+    """A face that was found, and its embedding.
 
     Attributes:
         box: of the picture.
@@ -116,7 +116,7 @@ def medoid(embeddings: list[np.ndarray]) -> np.ndarray:
 
 
 def _scale(width: int, height: int) -> float:
-    """How far a picture is enlarged or shrunk for the finder, which knows no face under 80 pixels."""
+    """The factor by which a picture is resized for the finder, which knows no face under 80 pixels."""
     return min(max(1.0, 3 * _SMALLEST / min(width, height)), _LARGEST_PICTURE / max(width, height))
 
 

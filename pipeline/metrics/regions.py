@@ -28,10 +28,10 @@ INSIDE = 0.5
 REGIONS = ("face", "hands")
 
 SCORE = 0.3
-"""Of a keypoint from which it is believed."""
+"""The score from which a keypoint is trusted."""
 
 _PARTS = {"face": ((FACE, 1.5),), "hands": ((LEFT_HAND, 1.4), (RIGHT_HAND, 1.4))}  # points, side over extent
-_SHARE = 0.5  # of a part's points that must be believed
+_SHARE = 0.5  # of a part's points that must be trusted
 SMALLEST = 16
 """Pixels of a crop's shorter side; smaller ones show nothing that could be judged."""
 

@@ -1,4 +1,4 @@
-"""Image formation: what every backend of ``render`` computes, and the numbers that it shares.
+"""Image formation: the equations that every backend of ``render`` computes, and the numbers in them.
 
 A Gaussian with mean m, unit quaternion q, scales s, opacity o and colour c (3D Gaussian splatting,
 Kerbl et al. 2023; EWA splatting, Zwicker et al. 2001; the constants are gsplat's):

@@ -42,7 +42,7 @@ def render_numba(gaussians: Gaussians, camera: Camera) -> Rendering:
 
 @dataclasses.dataclass(frozen=True)
 class _Drawing:
-    """What the backward pass needs of the forward pass.
+    """The results of the forward pass that the backward pass needs.
 
     Attributes:
         pose: the camera's rotation and translation, float64.

@@ -135,7 +135,7 @@ def _interval(centre, radius, size):
 
 @kernel
 def _has_image(mean, norm, scale, color, opacity, point, lens):
-    """Whether a Gaussian is finite and before the camera. Written so that NaN answers no.
+    """True for a Gaussian that is finite and before the camera. Written so that NaN gives False.
 
     Not with math.isfinite: it asks whether x - x equals itself, and "reassoc" cancels a sum against itself.
     """

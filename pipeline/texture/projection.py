@@ -22,9 +22,9 @@ from pipeline.clip.fitted_clip import FittedClip
 from pipeline.texture.surface import FineSurface
 
 SAMPLES = 2  # a pixel, in each direction
-GRAZING = 0.25  # cosine of the angle between normal and view under which nothing is believed
+GRAZING = 0.25  # cosine of the angle between normal and view under which no colour is taken
 DEPTH = 0.012  # metres behind the nearest surface at which a vertex still counts as seen
-EDGE = 0.012  # of the person's height: what lies nearer to the mask's edge is not believed
+EDGE = 0.012  # of the person's height: no colour is taken nearer to the mask's edge
 AGREEING = 24.0  # of 255: samples within this distance of the median are averaged
 SURE = 0.02  # summed weight from which a vertex is known; a frontal view at full resolution weighs 1
 
@@ -181,7 +181,7 @@ def paint(
     vertices: Tensor,  # [V, 3]
     carried: np.ndarray,  # [N, 3 + K]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A picture on black.
+    """The textured body as a camera sees it, on black.
 
     Args:
         camera: the view.

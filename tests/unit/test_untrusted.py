@@ -267,7 +267,9 @@ def test_links_may_not_lead_out_of_their_folder(tmp_path):
 BAD_JSON = (
     '{"a": NaN}',
     '{"a": Infinity}',
+    "[-Infinity]",
     "[1e999]",
+    "",
     "[" * 100_000,
     '{"a": 1',
     "\xff",
@@ -279,6 +281,11 @@ BAD_JSON = (
 def test_json_that_is_none_or_not_finite_names_itself(tmp_path, text):
     (tmp_path / "t.json").write_bytes(text.encode("latin1"))
     with pytest.raises(UserError, match=r"t\.json is not readable JSON"):
+        parse_json(tmp_path / "t.json", REMEDY)
+
+
+def test_missing_json_is_named(tmp_path):
+    with pytest.raises(UserError, match=rf"t\.json is missing: {REMEDY}"):
         parse_json(tmp_path / "t.json", REMEDY)
 
 
