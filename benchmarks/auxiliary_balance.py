@@ -27,9 +27,8 @@ from benchmarks.held_out_views import _job
 from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import load_body, read_poses
 from pipeline.clip.composite import composite_frame
-from pipeline.clip.frames import read_frame, read_mask, write_png
+from pipeline.clip.frames import read_frame, read_mask, spread_from_start, write_png
 from pipeline.clip.records import read_cameras
-from pipeline.clip.spread import spread_from_start
 from pipeline.errors import UserError
 from pipeline.metrics import psnr
 from pipeline.splat import render

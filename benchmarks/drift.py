@@ -138,7 +138,7 @@ def contestants(truth: Avatar) -> list[Run]:
 
     def fresh(half: bool) -> Avatar:
         body = open_body()
-        return Avatar(body, mean_identity(body), truth.kept, truth.architecture, 0, half).train()
+        return Avatar(body, mean_identity(body), truth.vertex_ids, truth.architecture, 0, half).train()
 
     rounded = fresh(False)
     with torch.no_grad():

@@ -116,7 +116,7 @@ class StraightforwardAvatar(nn.Module):
         theta = pose_features(rotation)
         geometry = self.pose_geometry(decoded.features, theta)
         color = self.pose_color(torch.cat([decoded.features, normals], 1), theta)
-        pose_offset = geometry[:, :3] * sizes.pose_offset_unit * self.surface.pliable
+        pose_offset = geometry[:, :3] * sizes.pose_offset_unit * self.surface.pose_movable
         log_scale = decoded.log_scale + 0.5 * geometry[:, 3:]
         color_logit = decoded.color_logit + color
         gaussians = Gaussians(

@@ -19,8 +19,8 @@ from pipeline.body import load_body
 from pipeline.clip.composite import composite_frame
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import interior
 from pipeline.run.job import Job
 from pipeline.run.process import make_results
 from pipeline.run.stage import Context

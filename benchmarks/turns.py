@@ -27,7 +27,7 @@ from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite_frame
 from pipeline.clip.frames import write_png
 from pipeline.config.request import parse_request
-from pipeline.metrics.face_identity import ASSETS, FaceReader, identity_cosine, identity_distance
+from pipeline.metrics.face_identity import ASSETS, FaceRecognizer, identity_cosine, identity_distance
 from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.run.job import open_job
 from pipeline.run.process import make_results
@@ -83,7 +83,7 @@ def shown(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return (255 * image.clamp(0, 1)).round().byte().numpy()
 
 
-def faces_of(reader: FaceReader, clip: JudgedClip, avatar: Avatar) -> tuple[list[float], list[float]]:
+def faces_of(reader: FaceRecognizer, clip: JudgedClip, avatar: Avatar) -> tuple[list[float], list[float]]:
     """Distance and cosine of the held-out frames' faces and the rendered ones."""
     distances, cosines = [], []
     for frame in clip.test:
@@ -102,7 +102,7 @@ def person(clip: JudgedClip, frame: int) -> np.ndarray:
     return (255 * image).round().byte().numpy()
 
 
-def own_distance(reader: FaceReader, clip: JudgedClip) -> float:
+def own_distance(reader: FaceRecognizer, clip: JudgedClip) -> float:
     """How far the filmed faces of held-out frames lie from that of the middle training frame."""
     train = clip.clip.split.train
     middle = reader.read(person(clip, train[len(train) // 2]))
@@ -123,7 +123,7 @@ def try_way(subject: str, way: str, words: dict[str, str]) -> tuple[Row, np.ndar
     folders = {name: one.folder for name, one in make_results(job, job.stages["train"].needs).items()}
     done = trained(job)
     clip = JudgedClip.read(folders["ingest"], folders["fit"], job.workspace.body_file, HELD_OUT)
-    reader = FaceReader(*(job.workspace.assets / asset for asset in ASSETS))
+    reader = FaceRecognizer(*(job.workspace.assets / asset for asset in ASSETS))
     distances, cosines = faces_of(reader, clip, done.avatar)
     psnr = clip.scores(done.avatar, Scorer({}))["psnr"]
     own = own_distance(reader, clip)

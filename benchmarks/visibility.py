@@ -26,7 +26,7 @@ import torch
 
 from benchmarks.machine import described, prepare
 from benchmarks.visibility_pictures import gradient_picture, unseen_error
-from pipeline.avatar.visibility import evidence_threshold
+from pipeline.avatar.otsu_threshold import evidence_threshold
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.config.request import parse_request
 from pipeline.errors import UserError
@@ -120,7 +120,7 @@ def megabytes(trainer: Trainer) -> float:
     surface = trainer.avatar.surface()
     with torch.no_grad():
         decoded = trainer.avatar.decode()
-    owners = (surface.canonical, surface.rig, decoded)
+    owners = (surface.canonical, surface.skinning_tables, decoded)
     tensors = [one for owner in owners for one in vars(owner).values() if isinstance(one, torch.Tensor)]
     for pair in (surface.samples, surface.neighbours):
         for matrix in (pair.matrix, pair.transpose):

@@ -72,7 +72,9 @@ def _rendered(subject: Any, trainer: Trainer, frame: int, camera: Camera) -> tup
     rendering = render(avatar.gaussians(pose), camera)
     avatar.train()
     seen = _seen_vertices(subject)
-    vertices = seen["surface"].rig.place(*seen["pose"](pose.rotation), pose.transl)[0][seen["often"]]
+    vertices = seen["surface"].skinning_tables.place(*seen["pose"](pose.rotation), pose.transl)[0][
+        seen["often"]
+    ]
     marks = np.zeros((camera.height, camera.width), np.uint8)
     for column, line in project(camera, vertices).round().int().tolist():
         if 0 <= column < camera.width and 0 <= line < camera.height:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
-from pipeline.error_messages import explain
-from pipeline.errors import UserError
+from pipeline.errors import UserError, error_message
 from pipeline.run.job import open_job, run_stage
 from pipeline.run.process import leave_reason
 from pipeline.run.stage import load_stages
@@ -69,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return 130
     except Exception as error:
-        message = explain(error, where)
+        message = error_message(error, where)
         leave_reason(message or f"{type(error).__name__}: {error} (a defect; its traceback is above)")
         if message is None:
             raise

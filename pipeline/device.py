@@ -1,4 +1,4 @@
-"""Where training computes: the setting's word as a torch device, and what goes there.
+"""The device that training computes on, and records of tensors moved to it.
 
 On a CPU the hot parts are numba kernels; elsewhere their plain torch twins run, which say the same.
 Equal inputs and settings give equal bytes on a CPU only: a GPU adds up in an order of its own. The key of an
@@ -45,7 +45,7 @@ def resolve(word: str) -> torch.device:
 
 
 def kernels_serve(tensor: Tensor) -> bool:
-    """Whether the numba kernels can compute what a tensor takes part in, or plain torch has to."""
+    """True where the numba kernels can compute with a tensor, False where plain torch has to."""
     return tensor.device.type == "cpu"
 
 

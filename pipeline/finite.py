@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.errors import UserError
 
@@ -52,7 +52,7 @@ def require_finite(tensors: Mapping[str, Tensor], who: str, where: str, remedy: 
 
 
 def finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether the tensors add up to a finite number, which says that every number in them is finite.
+    """True where the tensors add up to a finite number; then every number in them is finite.
 
     False says only that one may not be: large numbers overflow together.
     """
@@ -64,7 +64,7 @@ def finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def described(tensor: Tensor) -> str:
-    """How many numbers of a tensor are not finite, and which is the first of them."""
+    """A text that says how many numbers of a tensor are not finite, and names the first."""
     bad = ~tensor.detach().isfinite()
     place = bad.nonzero()[0].tolist()
     value = float(tensor[tuple(place)])
@@ -73,7 +73,7 @@ def described(tensor: Tensor) -> str:
 
 
 def rows_not_finite(tensor: Tensor) -> list[int]:
-    """Which rows of a tensor [T, ...] hold a number that is not finite."""
+    """The rows of a tensor [T, ...] that hold a number that is not finite."""
     return [int(row) for row in (~tensor.detach().isfinite()).flatten(1).any(1).nonzero()[:, 0]]
 
 
@@ -116,19 +116,3 @@ def _arrays(path: Path) -> Iterable[tuple[str, np.ndarray]]:
     with loaded:
         for name in loaded.files:
             yield name, loaded[name]
-
-
-def not_finite_in(value: Any, place: str = "") -> str | None:
-    """Where JSON content holds a number that is not finite: "means.test.psnr"; None where it holds none."""
-    if isinstance(value, float):
-        return None if math.isfinite(value) else place
-    parts: Iterable[tuple[Any, Any]] = ()
-    if isinstance(value, Mapping):
-        parts = value.items()
-    elif isinstance(value, list | tuple):
-        parts = enumerate(value)
-    for key, part in parts:
-        found = not_finite_in(part, f"{place}.{key}" if place else str(key))
-        if found is not None:
-            return found
-    return None

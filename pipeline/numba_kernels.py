@@ -1,4 +1,4 @@
-"""How the numba kernels are compiled, and how many threads they and torch compute on.
+"""The ways to compile a numba kernel, and the number of threads that kernels and torch compute on.
 
 Compiled kernels are kept on disk (in ``__pycache__``, or where NUMBA_CACHE_DIR says). That cache watches a
 kernel's own file and nothing else, so a kernel calls only kernels of its own file, and numbers from elsewhere

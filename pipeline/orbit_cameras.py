@@ -23,7 +23,7 @@ _OUTLIERS = 0.005  # share of the Gaussians that do not set the extent
 
 @dataclasses.dataclass(frozen=True)
 class Extent:
-    """What a turn about the vertical has to show.
+    """The space that cameras on a circle have to show.
 
     Attributes:
         centre: [3], metres; the turn's axis runs through it.
@@ -48,7 +48,7 @@ def relaxed_pose(arm_angle: float) -> Tensor:
 
 
 def visible_extent(gaussians: Gaussians) -> Extent:
-    """The extent of what is seen.
+    """The extent of the visible Gaussians.
 
     Gated Gaussians are either absent or transparent; both count for nothing.
     """
@@ -62,7 +62,7 @@ def visible_extent(gaussians: Gaussians) -> Extent:
 
 
 def visible_box(gaussians: Gaussians) -> np.ndarray:
-    """The lowest and the highest corner of what is seen, stray Gaussians apart: [2, 3], metres.
+    """The lowest and the highest corner of the visible Gaussians, strays apart: [2, 3], metres.
 
     Both are zero where nothing is seen.
     """

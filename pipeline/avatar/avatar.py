@@ -1,4 +1,4 @@
-"""The canonical triplane avatar and what it looks like in a pose (the paper's Sections 3.3, 3.5 and 3.6).
+"""The canonical triplane avatar, and its Gaussians in a pose (the paper's Sections 3.3, 3.5 and 3.6).
 
 Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads + residual
 colours of face and hands -> plus expression -> linear blend skinning -> Gaussians. The part before
@@ -17,12 +17,10 @@ from torch import Tensor, nn
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.head import Head
-from pipeline.avatar.nearest_skinning import OWN, nearest_rows, with_weights_of
 from pipeline.avatar.residual import Residuals, regions
-from pipeline.avatar.row_selection import put, take
-from pipeline.avatar.skinning_tables import Rig
-from pipeline.avatar.submesh import active_rows, restricted
-from pipeline.avatar.surface import Surface, build_surface, plane_regions
+from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
+from pipeline.avatar.sparse import gather_rows, scatter_rows
+from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
 from pipeline.avatar.triplane import Triplane
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
 from pipeline.device import autocast, moved
@@ -34,7 +32,7 @@ LARGEST_SCALE = 0.03  # metres
 
 @dataclasses.dataclass(frozen=True)
 class Decoded:
-    """What does not depend on the pose.
+    """The part of an avatar that does not depend on the pose.
 
     Attributes:
         surface: the level that was decoded.
@@ -78,16 +76,16 @@ class Avatar(nn.Module):
 
     Attributes:
         architecture: sizes.
-        kept: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
+        vertex_ids: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
         identity: the fitted identity; on the CPU, too.
         body_digest: of the body model that it was built on.
         surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
-        active: [K] bool, the kept vertices that the visibility gate leaves; see ``surface``.
+        active: [K] bool, these vertices that the visibility gate leaves; see ``surface``.
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
-        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``skin.py``.
+        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
     """
 
     base_color: Tensor
@@ -98,7 +96,7 @@ class Avatar(nn.Module):
         self,
         body: BodyModel,
         identity: Identity,
-        kept: Tensor,  # [K]
+        vertex_ids: Tensor,  # [K]
         architecture: Architecture,
         seed: int = 0,
         half_precision: bool = True,
@@ -108,17 +106,18 @@ class Avatar(nn.Module):
         Args:
             body: the body model.
             identity: the subject's identity.
-            kept: [K] int64, the body vertices that carry Gaussians, sorted.
+            vertex_ids: [K] int64, the body vertices that carry Gaussians, sorted.
             architecture: sizes.
             seed: of the initial weights.
             half_precision: whether the heads run in bfloat16.
         """
         super().__init__()
-        self.architecture, self.kept, self.identity = architecture, kept, identity
+        self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
         meshes = [
-            build_canonical(body, identity, level, kept) for level in range(architecture.subdivisions + 1)
+            build_canonical(body, identity, level, vertex_ids)
+            for level in range(architecture.subdivisions + 1)
         ]
         planes, self.boxes = plane_regions(meshes[-1])
         residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
@@ -127,7 +126,7 @@ class Avatar(nn.Module):
             for mesh, parts in zip(meshes, residual, strict=True)
         ]
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
-        self.register_buffer("active", torch.ones(len(kept), dtype=torch.bool))
+        self.register_buffer("active", torch.ones(len(vertex_ids), dtype=torch.bool))
         self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
@@ -165,11 +164,11 @@ class Avatar(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its weights and surfaces are."""
+        """The device of its weights and surfaces."""
         return self.active.device
 
     def to(self, device: torch.device | str) -> Avatar:  # type: ignore[override]
-        """Moves weights and surfaces; what they are of is not for changing."""
+        """Moves weights and surfaces; their dtypes stay."""
         if torch.device(device) == self.device:
             return self
         super().to(device)
@@ -179,7 +178,7 @@ class Avatar(nn.Module):
         return self
 
     def gate(self, active: Tensor) -> None:
-        """Leaves only some of the kept vertices; others may come back with a later call.
+        """Leaves only some of the vertices; others may come back with a later call.
 
         Args:
             active: [K] bool, with at least one.
@@ -208,7 +207,7 @@ class Avatar(nn.Module):
         """Gives points off head and hands the skinning weights of the vertex that they now lie nearest."""
         decoded = self.decode()
         points = decoded.surface.canonical.vertices + decoded.offset
-        free = decoded.surface.pliable[:, 0] > 0
+        free = decoded.surface.pose_movable[:, 0] > 0
         rows = nearest_rows(points, self.surfaces[0].canonical.vertices, free)
         places = decoded.surface.pick(torch.arange(len(self.skin_rows), device=self.device))
         self.skin_rows.index_copy_(0, places, rows)
@@ -219,12 +218,14 @@ class Avatar(nn.Module):
         original = self._own_surfaces[0].canonical
         for level, own in enumerate(self._own_surfaces):
             mesh = with_weights_of(own.canonical, original, self.skin_rows[: len(own.canonical)])
-            self.surfaces[level] = dataclasses.replace(own, canonical=mesh, rig=Rig.build(mesh))
+            self.surfaces[level] = dataclasses.replace(
+                own, canonical=mesh, skinning_tables=SkinningTables.build(mesh)
+            )
         self._restricted.clear()
         self._baked = None
 
     def train(self, mode: bool = True) -> Avatar:
-        """As of ``nn.Module``; forgets what was decoded, since weights are about to change."""
+        """Sets the mode as ``nn.Module`` does, and forgets what was decoded: weights are about to change."""
         self._baked = None
         return super().train(mode)
 
@@ -260,11 +261,11 @@ class Avatar(nn.Module):
         Args:
             decoded: the pose-independent part.
             pose: of the frame.
-            noise: added to what the heads are told of the pose; for training.
+            noise: added to theta; for training.
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
-            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are asked for;
-                all if None.
-            theta: what the heads are told of the pose, see ``pose_features``; that of ``pose`` if None.
+            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are evaluated
+                for; all if None.
+            theta: the heads' pose condition, see ``pose_features``; that of ``pose`` if None.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
@@ -274,7 +275,7 @@ class Avatar(nn.Module):
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         if self.pose_heads_active:
-            normals = decoded.surface.rig.normals(transforms, shape)
+            normals = decoded.surface.skinning_tables.normals(transforms, shape)
             pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
             shape, log_scale = shape + pose_offset, log_scale + scale_change
             color_logit = color_logit + color_change
@@ -286,7 +287,7 @@ class Avatar(nn.Module):
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
-            quaternions=decoded.surface.rig.place(transforms, shape, pose.transl)[1],
+            quaternions=decoded.surface.skinning_tables.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, log_scale),
             colors=torch.sigmoid(color_logit),
             opacities=self._opacities(canonical),
@@ -299,14 +300,14 @@ class Avatar(nn.Module):
         """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
         features, count = decoded.features, len(normals)
         if rows is not None:
-            features, normals = take(features, rows), take(normals, rows)
+            features, normals = gather_rows(features, rows), gather_rows(normals, rows)
         with self._autocast():
             geometry = self.pose_geometry(features, theta)
             color = self.pose_color(torch.cat([features, normals], 1), theta)
         geometry, color = geometry.float(), color.float()
         if rows is not None:
-            geometry, color = put(geometry, rows, count), put(color, rows, count)
-        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pliable
+            geometry, color = scatter_rows(geometry, rows, count), scatter_rows(color, rows, count)
+        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pose_movable
         return offset, 0.5 * geometry[:, 3:], color
 
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
@@ -341,7 +342,7 @@ class Avatar(nn.Module):
             time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
                 the training frames' interval; None, as for a motion that was never filmed, gives what
                 the heads learnt to answer without a clock (see ``residual.py``).
-            theta: what the heads are told of the pose; that of ``pose`` if None.
+            theta: the heads' pose condition; that of ``pose`` if None.
         """
         if self._baked is None:
             with torch.no_grad():
@@ -349,11 +350,11 @@ class Avatar(nn.Module):
         seen = self.pose(self._baked, pose, time=time, theta=theta).gaussians
         if self.unseen == "nothing" or bool(self.active.all()):
             return seen
-        bare = self.bare(self.unseen_surface(), pose)
+        bare = self.base_gaussians(self.unseen_surface(), pose)
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
-    def bare(self, surface: Surface, pose: Pose) -> Gaussians:
-        """The fitted body in its base colours, in a pose: what no network has a say in.
+    def base_gaussians(self, surface: Surface, pose: Pose) -> Gaussians:
+        """The fitted body in its base colours, in a pose; no network takes part.
 
         Args:
             surface: which of its vertices.
@@ -365,14 +366,14 @@ class Avatar(nn.Module):
         shape = _rest_shape(canonical, pose)
         return Gaussians(
             means=transform_points(blended, shape) + pose.transl,
-            quaternions=surface.rig.place(transforms, shape, pose.transl)[1],
+            quaternions=surface.skinning_tables.place(transforms, shape, pose.transl)[1],
             scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
             colors=torch.sigmoid(surface.pick(self.base_color)),
             opacities=self._opacities(canonical),
         )
 
     def unseen_surface(self) -> Surface:
-        """What the gate took from the finest level; only where it took something."""
+        """The vertices of the finest level that the gate took; to be called only where it took some."""
         known = self._restricted.get(-1)
         if known is None or not torch.equal(known[0], self.active):
             left = self.surface().rows

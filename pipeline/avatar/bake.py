@@ -1,4 +1,4 @@
-"""A finished avatar with everything that does not depend on the pose computed once and for all.
+"""A finished avatar whose pose-independent part is computed once and for all.
 
 ``Avatar.gaussians`` decodes the static part once, too. Baking goes on from there: the features are gone, and
 in their place stands what the first layer of each pose head makes of them, ``W_f f_i + b``; static offsets
@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, Decoded, pose_features
-from pipeline.avatar.fused_head import Layers, arranged, arranged_rows, finish
+from pipeline.avatar.fused_head import HeadParameters, arranged, arranged_rows, finish
 from pipeline.avatar.head import Head
 from pipeline.avatar.residual import encode, time_code
-from pipeline.avatar.skinning_tables import Rig
+from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
 from pipeline.splat import Gaussians
 
@@ -31,13 +31,13 @@ class BakedHead:
         products: [N, C], ``W_f f_i + b``, in the precision that the head runs in.
         condition: [C, P] float32, what the shared vector is multiplied with.
         own: [E, C] float32, what a point's own further inputs are multiplied with.
-        layers: the others, arranged (see ``fused.py``).
+        layers: the others, arranged (see ``fused_head.py``).
     """
 
     products: Tensor  # [N, C]
     condition: Tensor  # [C, P]
     own: Tensor  # [E, C]
-    layers: Layers
+    layers: HeadParameters
 
     def __call__(self, shared: Tensor, own: Tensor | None = None) -> Tensor:
         """Decodes a shared vector [P] and each point's own inputs [N, E] to [N, outputs] float32."""
@@ -60,7 +60,7 @@ class BakedResidual:
 
 @dataclasses.dataclass(frozen=True)
 class Constants:
-    """What every pose needs of the body and of the static heads.
+    """The constants of body and static heads that every pose needs.
 
     Attributes:
         points: [N, 3], rest vertices and static offsets, metres.
@@ -90,7 +90,7 @@ class BakedAvatar:
 
     Attributes:
         constants: of the body and of the static heads.
-        rig: of the mesh.
+        skinning_tables: of the mesh.
         parents: of the joints, -1 for the root.
         opacity: of every Gaussian.
         geometry, color: the pose heads; None if the avatar has none that are active.
@@ -102,7 +102,7 @@ class BakedAvatar:
     """
 
     constants: Constants
-    rig: Rig
+    skinning_tables: SkinningTables
     parents: tuple[int, ...]
     opacity: float
     geometry: BakedHead | None
@@ -130,24 +130,24 @@ class BakedAvatar:
         Args:
             pose: of the body, in the world.
             time: seconds from the clip's start, or None, for the residual colours.
-            theta: what the heads are told of the pose; that of ``pose`` if None.
+            theta: the heads' pose condition; that of ``pose`` if None.
         """
         constants, theta = self.constants, pose_features(pose.rotation) if theta is None else theta
         transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
         points = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         if self.geometry is not None and self.color is not None:
-            normals = self.rig.normals(transforms, points)
+            normals = self.skinning_tables.normals(transforms, points)
             change = self.geometry(theta)
             points = torch.addcmul(points, change[:, :3], constants.offset_unit)
             log_scale = log_scale + 0.5 * change[:, 3:]
             color_logit = color_logit + self.color(theta, normals)
-        means, quaternions = self.rig.place(transforms, points, pose.transl)
+        means, quaternions = self.skinning_tables.place(transforms, points, pose.transl)
         answers = self._residuals(means, theta, time)
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
-            means, quaternions = self.rig.place(transforms, points, pose.transl)
+            means, quaternions = self.skinning_tables.place(transforms, points, pose.transl)
         for rows, answer in answers:
             color_logit = color_logit.index_add(0, rows, answer[:, :3])
         scales = constants.scales * log_scale.clamp(*LOG_SCALE_RANGE).exp_()
@@ -170,7 +170,7 @@ class BakedAvatar:
         return points + (constants.correctives @ turned.to(constants.correctives.dtype)).float()
 
     def _residuals(self, means: Tensor, theta: Tensor, time: float | None) -> list[tuple[Tensor, Tensor]]:
-        """Each part's rows and what its head says of them, [M, 3] logits or [M, 6] with moves."""
+        """Each part's rows and its head's output, [M, 3] logits or [M, 6] with moves."""
         if not self.residuals:
             return []
         condition = torch.cat([time_code(time, self.time_range, self.time_frequencies), theta])
@@ -189,12 +189,12 @@ def bake(avatar: Avatar) -> BakedAvatar:
     """
     decoded = avatar.decode()
     surface, features = decoded.surface, decoded.features
-    kind = torch.bfloat16 if avatar.half_precision else torch.float32
+    dtype = torch.bfloat16 if avatar.half_precision else torch.float32
     heads: list[BakedHead | None] = [None, None]
     if avatar.pose_heads_active:
         heads = [
-            _baked_head(avatar.pose_geometry, features, kind),
-            _baked_head(avatar.pose_color, features, kind),
+            _baked_head(avatar.pose_geometry, features, dtype),
+            _baked_head(avatar.pose_color, features, dtype),
         ]
     residuals, networks = dict[str, BakedResidual](), avatar.residuals
     posed = networks.place == "posed"
@@ -202,11 +202,11 @@ def bake(avatar: Avatar) -> BakedAvatar:
         for region in surface.residual:
             known = region.encoded[:, :0] if posed else region.encoded
             residuals[region.part] = BakedResidual(
-                region.rows, _baked_head(networks.heads[region.part], known, kind)
+                region.rows, _baked_head(networks.heads[region.part], known, dtype)
             )
     return BakedAvatar(
         constants=_constants(avatar, decoded),
-        rig=surface.rig,
+        skinning_tables=surface.skinning_tables,
         parents=surface.canonical.parents,
         opacity=avatar.architecture.opacity,
         geometry=heads[0],
@@ -220,17 +220,17 @@ def bake(avatar: Avatar) -> BakedAvatar:
     )
 
 
-def _baked_head(head: nn.Module, points: Tensor, kind: torch.dtype) -> BakedHead:
+def _baked_head(head: nn.Module, points: Tensor, dtype: torch.dtype) -> BakedHead:
     """The head for given points [N, I]; inputs of the first layer beyond these I stay inputs."""
     assert isinstance(head, Head) and head.condition is not None
-    layers = Layers.of([head.first, *head.hidden, head.last], list(head.norms))
-    ready, groups, known = arranged(layers, kind), layers.groups, points.shape[1]
+    layers = HeadParameters.of([head.first, *head.hidden, head.last], list(head.norms))
+    ready, groups, known = arranged(layers, dtype), layers.groups, points.shape[1]
     first = arranged_rows(head.first.weight, groups)
     products = torch.addmm(arranged_rows(head.first.bias, groups), points, first[:, :known].t())
     # The first layer's own weights have done their work.
     rest = dataclasses.replace(ready, weights=(ready.weights[0][:, :0], *ready.weights[1:]))
     condition = arranged_rows(head.condition.weight, groups).contiguous()
-    return BakedHead(products.to(kind), condition, first[:, known:].t().contiguous(), rest)
+    return BakedHead(products.to(dtype), condition, first[:, known:].t().contiguous(), rest)
 
 
 def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
@@ -245,6 +245,6 @@ def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
         scales=torch.cat([across, across.mean(1, keepdim=True) * sizes.thickness], 1),
         log_scale=decoded.log_scale.contiguous(),
         color_logit=decoded.color_logit.contiguous(),
-        offset_unit=sizes.pose_offset_unit * decoded.surface.pliable,
+        offset_unit=sizes.pose_offset_unit * decoded.surface.pose_movable,
         joints=canonical.joints,
     )

@@ -27,7 +27,7 @@ from pipeline.body import (
     subdivide,
     vertex_normals,
 )
-from pipeline.body.mouth import close_mouth
+from pipeline.body.mesh import close_mouth
 
 HEAD = ("head", "face")
 HANDS = ("left_hand", "right_hand")
@@ -36,7 +36,7 @@ SMALLEST_SPACING, LARGEST_SPACING = 1e-3, 0.05  # metres; a guard against sliver
 
 @dataclasses.dataclass(frozen=True)
 class Canonical:
-    """The Gaussians' home.
+    """The canonical mesh of one level of subdivision; each vertex carries a Gaussian.
 
     Attributes:
         vertices: [N, 3], metres.
@@ -85,17 +85,17 @@ def directed_edges(faces: Tensor) -> Tensor:
     return torch.cat([once, once.flip(1)])
 
 
-def dilate(kept: Tensor, faces: Tensor, rings: int) -> Tensor:
-    """Adds the neighbours of the kept vertices, ``rings`` times: [V] bool -> [V] bool."""
+def dilate(mask: Tensor, faces: Tensor, rings: int) -> Tensor:
+    """Adds the neighbours of the marked vertices, ``rings`` times: [V] bool -> [V] bool."""
     start, end = directed_edges(faces).unbind(1)
     for _ in range(rings):
-        kept = kept.clone()
-        kept[end[kept[start]]] = True
-    return kept
+        mask = mask.clone()
+        mask[end[mask[start]]] = True
+    return mask
 
 
 def build_canonical(
-    body: BodyModel, identity: Identity, levels: int, kept: Tensor | None = None
+    body: BodyModel, identity: Identity, levels: int, vertex_ids: Tensor | None = None
 ) -> Canonical:
     """The canonical mesh of one identity.
 
@@ -103,17 +103,17 @@ def build_canonical(
         body: the body model.
         identity: the subject's fitted identity.
         levels: of midpoint subdivision: 0, 1 or 2.
-        kept: [K] int64, body vertices that stay, sorted; all of them if None. A triangle stays if
+        vertex_ids: [K] int64, body vertices that stay, sorted; all of them if None. A triangle stays if
             its three vertices do, a vertex stays even when no triangle of it does.
 
     Raises:
-        ValueError: if ``kept`` is empty or names a vertex that the body has not.
+        ValueError: if ``vertex_ids`` is empty or names a vertex that the body has not.
     """
     vertices = rest_vertices(body, identity)
     faces = close_mouth(vertices, body.faces)
-    if kept is None:
-        kept = torch.arange(len(vertices))
-    if len(kept) == 0 or int(kept.max()) >= len(vertices):
+    if vertex_ids is None:
+        vertex_ids = torch.arange(len(vertices))
+    if len(vertex_ids) == 0 or int(vertex_ids.max()) >= len(vertices):
         raise ValueError(f"the kept vertices must be some of the body's {len(vertices)}")
     carried = [
         vertices,
@@ -124,8 +124,8 @@ def build_canonical(
     ]
     if body.pose_directions is not None:
         carried.append(body.pose_directions)
-    faces = faces_among(faces, kept, len(vertices))
-    faces, attributes = subdivide(faces, *(attribute[kept] for attribute in carried), levels=levels)
+    faces = faces_among(faces, vertex_ids, len(vertices))
+    faces, attributes = subdivide(faces, *(attribute[vertex_ids] for attribute in carried), levels=levels)
     vertices, weights, directions, labels, normals, *correctives = attributes
     frames = tangent_frames(functional.normalize(normals, dim=-1))
     return Canonical(
@@ -156,7 +156,7 @@ def tangent_frames(normals: Tensor) -> Tensor:
 
 
 def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
-    """How far each vertex's neighbours lie along its two tangents, [N, 2], metres, within sane bounds.
+    """The distance of each vertex's neighbours along its two tangents, [N, 2], metres, clamped.
 
     ``sqrt(2 mean (e . t)^2)`` over the edges e at the vertex: the edge length where triangles are
     regular, and more along than across where they are long and thin. Round Gaussians of the mean
@@ -169,9 +169,9 @@ def tangent_spacing(vertices: Tensor, faces: Tensor, frames: Tensor) -> Tensor:
     return (2 * total / degree[:, None]).sqrt().clamp(SMALLEST_SPACING, LARGEST_SPACING)
 
 
-def faces_among(faces: Tensor, kept: Tensor, count: int) -> Tensor:
+def faces_among(faces: Tensor, vertex_ids: Tensor, count: int) -> Tensor:
     """The triangles whose three corners are kept, in the numbers that these then have: [F, 3] -> [G, 3]."""
     new_index = torch.full((count,), -1, dtype=torch.long, device=faces.device)
-    new_index[kept] = torch.arange(len(kept), device=faces.device)
+    new_index[vertex_ids] = torch.arange(len(vertex_ids), device=faces.device)
     inside = (new_index[faces] >= 0).all(1)
     return new_index[faces[inside]]

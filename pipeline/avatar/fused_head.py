@@ -1,6 +1,6 @@
 """A whole decoding head at once on a CPU: linear layers with GroupNorm and ReLU between, and their gradient.
 
-``heads.Head`` says what is computed, layer by layer. Three things make the same cheaper here.
+``head.Head`` says what is computed, layer by layer. Three things make the same cheaper here.
 
 - GroupNorm subtracts each group's mean, which is linear. So the mean is taken out of the weights before the
   layer (a matrix of 128 x 128) and not out of its output (one of N x 128); what is left of the norm is a
@@ -36,7 +36,7 @@ ROWS = 4096  # at a time
 
 
 @dataclasses.dataclass(frozen=True)
-class Layers:
+class HeadParameters:
     """A head's parameters.
 
     Attributes:
@@ -57,14 +57,14 @@ class Layers:
         return (*self.weights, *self.biases, *self.norm_weights, *self.norm_biases)
 
     @classmethod
-    def from_flat(cls, tensors: tuple[Tensor, ...], groups: int) -> Layers:
+    def from_flat(cls, tensors: tuple[Tensor, ...], groups: int) -> HeadParameters:
         """The inverse of ``flat``."""
         count = (len(tensors) + 2) // 4
         weights, biases, norms = tensors[:count], tensors[count : 2 * count], tensors[2 * count :]
         return cls(weights, biases, norms[: count - 1], norms[count - 1 :], groups)
 
     @classmethod
-    def of(cls, linear: Sequence[Any], norms: Sequence[Any]) -> Layers:
+    def of(cls, linear: Sequence[Any], norms: Sequence[Any]) -> HeadParameters:
         """The parameters of linear layers and of the ``GroupNormReLU`` after each but the last."""
         return cls(
             weights=tuple(one.weight for one in linear),
@@ -75,22 +75,22 @@ class Layers:
         )
 
 
-def decode(points: Tensor, layers: Layers, kind: torch.dtype) -> Tensor:
-    """The head's output for every row: [N, in] -> [N, out] of dtype ``kind``, differentiable.
+def decode(points: Tensor, layers: HeadParameters, dtype: torch.dtype) -> Tensor:
+    """The head's output for every row: [N, in] -> [N, out] in ``dtype``, differentiable.
 
     Args:
         points: [N, in].
         layers: float32, on the CPU.
-        kind: float32 or bfloat16, of the products and of what is kept for the backward pass.
+        dtype: float32 or bfloat16, of the products and of what is kept for the backward pass.
     """
     if torch.is_grad_enabled():
-        return _Decode.apply(layers.groups, kind, points, *layers.flat())
+        return _Decode.apply(layers.groups, dtype, points, *layers.flat())
     with torch.autocast("cpu", enabled=False):
-        return _forward(points.to(kind), arranged(layers, kind), None)
+        return _forward(points.to(dtype), arranged(layers, dtype), None)
 
 
-def arranged(layers: Layers, kind: torch.dtype) -> Layers:
-    """The same head with centred weights and interleaved groups, its products' weights of dtype ``kind``."""
+def arranged(layers: HeadParameters, dtype: torch.dtype) -> HeadParameters:
+    """The same head with centred weights and interleaved groups, its products' weights in ``dtype``."""
     groups, last = layers.groups, len(layers.weights) - 1
     order = _order(len(layers.biases[0]), groups)
     weights, biases = [], []
@@ -98,15 +98,15 @@ def arranged(layers: Layers, kind: torch.dtype) -> Layers:
         weight = weight.detach() if place == 0 else weight.detach()[:, order]
         if place < last:
             weight, bias = _centred(weight, groups)[order], _centred(bias.detach(), groups)[order]
-        weights.append(weight.to(kind).contiguous())
-        biases.append(bias.detach().to(kind))
+        weights.append(weight.to(dtype).contiguous())
+        biases.append(bias.detach().to(dtype))
     norm_weights = tuple(one.detach()[order] for one in layers.norm_weights)
     norm_biases = tuple(one.detach()[order] for one in layers.norm_biases)
-    return Layers(tuple(weights), tuple(biases), norm_weights, norm_biases, groups)
+    return HeadParameters(tuple(weights), tuple(biases), norm_weights, norm_biases, groups)
 
 
 def arranged_rows(values: Tensor, groups: int) -> Tensor:
-    """What a further input of the first layer is multiplied with: [C, ...] centred and interleaved."""
+    """Weights of a further input of the first layer, centred and interleaved: [C, ...]."""
     return _centred(values.detach(), groups)[_order(len(values), groups)]
 
 
@@ -114,7 +114,7 @@ def finish(
     products: Tensor,  # [N, C]
     shared: Tensor,  # [C]
     own: tuple[Tensor, Tensor],  # [N, E], [E, C]
-    layers: Layers,
+    layers: HeadParameters,
 ) -> Tensor:
     """A head's output from the finished products of its first layer, without gradient.
 
@@ -144,7 +144,7 @@ def finish(
     return output
 
 
-def _norm_relu(z: Tensor, place: int, layers: Layers, y: Tensor) -> None:
+def _norm_relu(z: Tensor, place: int, layers: HeadParameters, y: Tensor) -> None:
     norm = bits(layers.norm_weights[place]), bits(layers.norm_biases[place])
     lanes = lanes_of(z.shape[1], layers.groups)
     norm_relu(bits(z), *norm, lanes, np.uint64(layers.groups), bits(y))
@@ -152,10 +152,10 @@ def _norm_relu(z: Tensor, place: int, layers: Layers, y: Tensor) -> None:
 
 class _Decode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, groups: int, kind: torch.dtype, points: Tensor, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, groups: int, dtype: torch.dtype, points: Tensor, *tensors: Tensor) -> Tensor:
         with torch.autocast("cpu", enabled=False):
-            layers = arranged(Layers.from_flat(tensors, groups), kind)
-            rows = points.to(kind).contiguous()
+            layers = arranged(HeadParameters.from_flat(tensors, groups), dtype)
+            rows = points.to(dtype).contiguous()
             hidden = [rows.new_empty(len(rows), len(bias)) for bias in layers.norm_biases]
             output = _forward(rows, layers, hidden)
         ctx.groups, ctx.layers = groups, layers
@@ -174,7 +174,7 @@ class _Decode(torch.autograd.Function):
         return None, None, to_points, *_restored(gradients, ctx.groups).flat()
 
 
-def _forward(rows: Tensor, layers: Layers, hidden: list[Tensor] | None) -> Tensor:
+def _forward(rows: Tensor, layers: HeadParameters, hidden: list[Tensor] | None) -> Tensor:
     """The output; what goes into the norms is written to ``hidden`` if the backward pass will want it."""
     use_torch_threads()
     output = rows.new_empty(len(rows), len(layers.biases[-1]))
@@ -193,8 +193,8 @@ def _forward(rows: Tensor, layers: Layers, hidden: list[Tensor] | None) -> Tenso
 
 
 def _backward(
-    gradient: Tensor, rows: Tensor, hidden: list[Tensor], layers: Layers, wanted: bool
-) -> tuple[Tensor | None, Layers]:
+    gradient: Tensor, rows: Tensor, hidden: list[Tensor], layers: HeadParameters, wanted: bool
+) -> tuple[Tensor | None, HeadParameters]:
     """The gradients of the rows, if wanted, and of the arranged parameters (in float32)."""
     use_torch_threads()
     count, channels = len(hidden), hidden[0].shape[1]
@@ -229,10 +229,10 @@ def _backward(
     totals = [torch.from_numpy(one.sum(0)) for one in sums]
     to_biases = (*(total[2] for total in totals), gradient.sum(0, dtype=torch.float32))
     norms = tuple(total[0] for total in totals), tuple(total[1] for total in totals)
-    return to_rows, Layers(tuple(to_weights), to_biases, *norms, layers.groups)
+    return to_rows, HeadParameters(tuple(to_weights), to_biases, *norms, layers.groups)
 
 
-def _restored(gradients: Layers, groups: int) -> Layers:
+def _restored(gradients: HeadParameters, groups: int) -> HeadParameters:
     """The gradients of the parameters as they are, from those of the arranged ones."""
     last = len(gradients.weights) - 1
     back = _order(len(gradients.biases[0]), groups).argsort()
@@ -245,7 +245,7 @@ def _restored(gradients: Layers, groups: int) -> Layers:
         biases.append(bias)
     norm_weights = tuple(one[back] for one in gradients.norm_weights)
     norm_biases = tuple(one[back] for one in gradients.norm_biases)
-    return Layers(tuple(weights), tuple(biases), norm_weights, norm_biases, groups)
+    return HeadParameters(tuple(weights), tuple(biases), norm_weights, norm_biases, groups)
 
 
 def _order(channels: int, groups: int) -> Tensor:

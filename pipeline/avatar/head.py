@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from pipeline.avatar.fused_head import Layers, decode
+from pipeline.avatar.fused_head import HeadParameters, decode
 from pipeline.avatar.head_kernels import EPSILON
 from pipeline.device import autocast, kernels_serve
 
@@ -16,7 +16,7 @@ from pipeline.device import autocast, kernels_serve
 class GroupNormReLU(nn.Module):
     """``relu(torch.nn.GroupNorm(x))`` for [N, C] inputs, by ``layer_norm`` on a view.
 
-    On a CPU ``fused.py`` computes it together with the layers around it.
+    On a CPU ``fused_head.py`` computes it together with the layers around it.
     """
 
     def __init__(self, groups: int, channels: int):
@@ -68,18 +68,18 @@ class Head(nn.Module):
         """Decodes [N, inputs] and an optional shared vector [condition] to [N, outputs]."""
         if self.condition is not None and condition is None:
             raise ValueError("this head is conditioned on a vector, and none was given")
-        kind = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
-        if kernels_serve(points) and kind in (torch.float32, torch.bfloat16):
-            return decode(points, self._layers(condition), kind)
+        dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
+        if kernels_serve(points) and dtype in (torch.float32, torch.bfloat16):
+            return decode(points, self._layers(condition), dtype)
         layers = self._layers(condition)
         x = self.norms[0](functional.linear(points, layers.weights[0], layers.biases[0]))
         x = self.norms[1](self.hidden[0](x))
         x = self.norms[2](self.hidden[1](x))
         return self.last(x)
 
-    def _layers(self, condition: Tensor | None) -> Layers:
+    def _layers(self, condition: Tensor | None) -> HeadParameters:
         """The parameters, the condition's part added to the first bias."""
-        layers = Layers.of([self.first, *self.hidden, self.last], list(self.norms))
+        layers = HeadParameters.of([self.first, *self.hidden, self.last], list(self.norms))
         if self.condition is None or condition is None:
             return layers
         with autocast(condition.device, enabled=False):  # one small product: exact for nothing

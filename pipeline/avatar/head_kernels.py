@@ -1,4 +1,4 @@
-"""The kernels of ``fused.py``: the norm between a head's layers, for centred rows with interleaved groups.
+"""The kernels of ``fused_head.py``: the norm between layers, for centred rows with interleaved groups.
 
 Numba does not know bfloat16: it is read as the upper half of a float32, from memory seen as uint16.
 """
@@ -19,7 +19,7 @@ CHUNKS = 16  # of rows; sums over rows are added up chunk by chunk, whatever the
 
 
 def lanes_of(channels: int, groups: int) -> np.uint64:
-    """How many channels the kernels take at a time: a power of two times the groups."""
+    """The number of channels that the kernels take at a time: a power of two times the groups."""
     lanes = groups
     while lanes * 2 <= MOST_LANES and channels % (lanes * 2) == 0:
         lanes *= 2

@@ -1,7 +1,7 @@
 """Part-specific residual colours: face, left hand, right hand (the paper's Section 3.5, Equation 7).
 
-A small head a part is told where a Gaussian lies, when the picture was taken and the pose, and adds
-what it knows to the colour. It does not move a Gaussian: the paper's ablation loses 0.6 dB by it
+Each part has a small head, whose inputs are a Gaussian's place, the time and the pose, and whose output is
+added to the colour. It does not move a Gaussian: the paper's ablation loses 0.6 dB by it
 (supplement E.3, Table A4). ``residual_moves`` is that ablation: three more outputs a head, an
 offset of the centre that no regulariser holds.
 
@@ -144,7 +144,7 @@ class Residuals(nn.Module):
         groups: int,
         moves: bool = False,
     ):
-        """Heads that add nothing yet.
+        """Heads whose output is zero until they are trained.
 
         Args:
             parts: those with a head.
@@ -210,7 +210,7 @@ class Residuals(nn.Module):
 
 
 def zero_layer(inputs: int, outputs: int) -> nn.Linear:
-    """A last layer that says nothing yet."""
+    """A last layer whose output is zero until it is trained."""
     layer = nn.Linear(inputs, outputs)
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)

@@ -1,4 +1,4 @@
-"""Posing Gaussians without gradient: skinning, normals and what a head's output becomes.
+"""Skinning of Gaussians: the weights that each point has, and posing without gradient.
 
 The same as ``Avatar.pose`` computes in torch, on a CPU each in one pass over the Gaussians. A point hangs on
 a few of the 55 joints only; the others' weights are zero and are left out here. ``plain_normals`` and
@@ -12,6 +12,7 @@ import dataclasses
 import numba
 import numpy as np
 import roma
+import scipy.spatial
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ from pipeline.avatar.head_kernels import CHUNKS
 from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
 from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads
+
+OWN = -1  # in place of a row: the weights that a point had
 
 
 def joints_of_points(skinning_weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,8 +45,8 @@ def faces_of_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rig:
-    """What skinning needs of a canonical mesh; all tensors are contiguous, floating ones float32.
+class SkinningTables:
+    """The tables that skinning of a canonical mesh reads; all contiguous, floating ones float32.
 
     Attributes:
         joints_of, weights: [N, K] uint8 and float32, see ``joints_of_points``.
@@ -60,8 +63,8 @@ class Rig:
     around: Tensor
 
     @classmethod
-    def build(cls, canonical: Canonical) -> Rig:
-        """The rig of a mesh."""
+    def build(cls, canonical: Canonical) -> SkinningTables:
+        """The tables of a mesh."""
         joints_of, weights = joints_of_points(canonical.skinning_weights)
         starts, around = faces_of_vertices(canonical.faces, len(canonical))
         faces = canonical.faces.int().contiguous()
@@ -109,24 +112,26 @@ class Rig:
 
 
 @torch.no_grad()
-def plain_normals(rig: Rig, transforms: Tensor, points: Tensor) -> Tensor:
-    """The plain twin of ``Rig.normals``."""
-    blended = _blended(rig, transforms)
-    return vertex_normals(transform_points(blended, points), rig.faces.long())
+def plain_normals(tables: SkinningTables, transforms: Tensor, points: Tensor) -> Tensor:
+    """The plain twin of ``SkinningTables.normals``."""
+    blended = _blended(tables, transforms)
+    return vertex_normals(transform_points(blended, points), tables.faces.long())
 
 
 @torch.no_grad()
-def plain_place(rig: Rig, transforms: Tensor, points: Tensor, transl: Tensor) -> tuple[Tensor, Tensor]:
-    """The plain twin of ``Rig.place``."""
-    blended = _blended(rig, transforms)
-    quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ rig.frames)
+def plain_place(
+    tables: SkinningTables, transforms: Tensor, points: Tensor, transl: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The plain twin of ``SkinningTables.place``."""
+    blended = _blended(tables, transforms)
+    quaternions = roma.rotmat_to_unitquat(blended[..., :3] @ tables.frames)
     return transform_points(blended, points) + transl, roma.quat_xyzw_to_wxyz(quaternions)
 
 
-def _blended(rig: Rig, transforms: Tensor) -> Tensor:
+def _blended(tables: SkinningTables, transforms: Tensor) -> Tensor:
     """The transform that each point is carried with, [N, 3, 4]."""
-    weights = transforms.new_zeros(len(rig.weights), len(transforms))
-    weights.scatter_(1, rig.joints_of.long(), rig.weights.to(weights))
+    weights = transforms.new_zeros(len(tables.weights), len(transforms))
+    weights.scatter_(1, tables.joints_of.long(), tables.weights.to(weights))
     return blend_transforms(transforms, weights)
 
 
@@ -241,3 +246,39 @@ def place_gaussians(transforms, joints, weights, points, frames, transl, means, 
                     turned[row, column] = total
                 means[i, row] = value
             _write_quaternion(turned, quaternions[i])
+
+
+def nearest_rows(points: Tensor, original: Tensor, free: Tensor) -> Tensor:
+    """The original vertex whose weights each moved point takes.
+
+    A Gaussian keeps the weights of its own vertex, interpolated over the subdivided mesh. ExAvatar, and with
+    it the paper (Section 3.6: SMPL-X's weights), takes those of the original vertex that lies nearest to the
+    moved point, head and hands apart: cloth that was pushed from the arm onto the chest then follows the
+    chest.
+
+    Args:
+        points: [N, 3] at rest, metres.
+        original: [K, 3], vertices of the unsubdivided mesh at rest, metres.
+        free: [N] bool, the points that may take another's weights.
+
+    Returns:
+        [N] int64, rows of ``original``; ``OWN`` where a point may not.
+    """
+    rows = torch.full((len(points),), OWN, device=points.device)
+    tree = scipy.spatial.cKDTree(original.detach().cpu().numpy())
+    _, nearest = tree.query(points[free].detach().cpu().numpy())
+    rows[free] = torch.from_numpy(nearest).long().to(points.device)
+    return rows
+
+
+def with_weights_of(mesh: Canonical, original: Canonical, rows: Tensor) -> Canonical:
+    """A mesh whose vertices have other skinning weights.
+
+    Args:
+        mesh: N vertices.
+        original: the unsubdivided mesh.
+        rows: [N], as ``nearest_rows`` gives them.
+    """
+    taken = original.skinning_weights[rows.clamp_min(0)]
+    weights = torch.where((rows == OWN)[:, None], mesh.skinning_weights, taken)
+    return dataclasses.replace(mesh, skinning_weights=weights)

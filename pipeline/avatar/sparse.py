@@ -1,14 +1,18 @@
-"""A constant sparse matrix times a dense one, with a gradient for the dense one only.
+"""Linear maps of per-Gaussian tensors with cheap gradients: constant sparse matrices, and a choice of rows.
 
 What never moves during training (which texels a canonical point reads, which vertices are
 neighbours) is written once as a sparse matrix. Its transpose is kept beside it, because the
 gradient is a product with the transpose and torch would rebuild that on every backward pass.
+
+Torch's own gradient of indexing adds up, row by row, because rows might repeat. In ``gather_rows`` they do
+not, and its gradient is a copy.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -99,3 +103,40 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
         return ctx.pair.transpose @ gradient.contiguous(), None
+
+
+def gather_rows(values: Tensor, rows: Tensor) -> Tensor:
+    """The rows of a tensor, differentiably: [N, C] -> [M, C].
+
+    Args:
+        values: [N, C].
+        rows: [M] int64, each at most once.
+    """
+    return _GatherRows.apply(values, rows)
+
+
+def scatter_rows(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """The inverse of ``gather_rows``: [M, C] -> [count, C], zero in all other rows."""
+    return _ScatterRows.apply(values, rows, count)
+
+
+class _GatherRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: Tensor) -> Tensor:
+        ctx.rows, ctx.count = rows, len(values)
+        return values.index_select(0, rows)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return scatter_rows(gradient, ctx.rows, ctx.count), None
+
+
+class _ScatterRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: Tensor, count: int) -> Tensor:
+        ctx.rows = rows
+        return values.new_zeros(count, *values.shape[1:]).index_copy_(0, rows, values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return gather_rows(gradient, ctx.rows), None, None

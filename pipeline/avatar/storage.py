@@ -35,7 +35,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of the avatar holds numbers that are not finite")
-    tensors["kept"] = avatar.kept
+    tensors["kept"] = avatar.vertex_ids
     header = {
         "format": FORMAT,
         "body": avatar.body_digest,

@@ -20,7 +20,7 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 MARGIN = 1.05  # keeps the outermost points off the outermost texels
 
 
-def region_boxes(points: Tensor, regions: Tensor) -> Tensor:
+def bounding_boxes(points: Tensor, regions: Tensor) -> Tensor:
     """The centre and half extent of each region's points, a margin included.
 
     Args:
@@ -44,7 +44,7 @@ def normalise(points: Tensor, regions: Tensor, boxes: Tensor) -> Tensor:
     return (points - box[:, 0]) / box[:, 1]
 
 
-def sampling(coordinates: Tensor, regions: Tensor, region_count: int, resolution: int) -> SparsePair:
+def sampling_matrix(coordinates: Tensor, regions: Tensor, region_count: int, resolution: int) -> SparsePair:
     """Bilinear sampling of all planes at fixed coordinates, as a sparse matrix.
 
     Equal to ``torch.nn.functional.grid_sample(..., align_corners=True, padding_mode="border")`` on

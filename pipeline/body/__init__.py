@@ -12,9 +12,10 @@ from pipeline.body.identity import (
 )
 from pipeline.body.joints import JOINT_NAMES, joint_index
 from pipeline.body.landmarks import Landmarks, PointSet, load_landmarks, locate
-from pipeline.body.mesh import draw_mesh, edges, rasterize, uniform_laplacian, vertex_normals
+from pipeline.body.mesh import edges, subdivide, uniform_laplacian, vertex_normals
 from pipeline.body.parts import PARTS, is_face, is_part, part_labels
 from pipeline.body.poses import Pose, Poses, read_poses, write_poses
+from pipeline.body.rasterize import draw_mesh, rasterize
 from pipeline.body.skinning import (
     blend_transforms,
     forward_kinematics,
@@ -28,7 +29,6 @@ from pipeline.body.skinning import (
     posed_vertices,
     transform_points,
 )
-from pipeline.body.subdivision import subdivide
 
 __all__ = [
     "JOINT_NAMES", "PARTS", "BodyModel", "Identity", "Landmarks", "PointSet", "Pose", "Poses",

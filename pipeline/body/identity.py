@@ -1,4 +1,4 @@
-"""Who somebody is to the body model: shape, joint offsets and face offsets, and their file."""
+"""A person's identity in the body model: betas, joint offsets and face offsets, and their file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """What does not change while somebody moves.
+    """The parameters of a person that do not change with the pose.
 
     Attributes:
         betas: beta, [B], unitless; B may be less than the body has.

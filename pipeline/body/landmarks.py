@@ -1,4 +1,4 @@
-"""Where the points that 2D estimators detect lie on the body.
+"""The places on the body of the points that 2D estimators detect.
 
 Four sets, each in its estimator's order:
 
@@ -54,7 +54,7 @@ class PointSet:
         return PointSet(self.joint.to(device), self.vertices.to(device), self.barycentrics.to(device))
 
     def compact(self) -> tuple[Tensor, PointSet]:
-        """What a fit needs to pose: only the vertices that these points touch.
+        """The vertices that these points touch, which are all that a fit has to pose.
 
         Returns:
             vertex_ids: [M] int64, rows of the body's arrays, ascending.
@@ -83,7 +83,7 @@ def join(*sets: PointSet) -> PointSet:
 
 
 def locate(points: PointSet, joints: Tensor, vertices: Tensor) -> Tensor:
-    """Where the points are on a posed body.
+    """The points' positions on a posed body.
 
     Args:
         points: K points.

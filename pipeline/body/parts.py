@@ -1,4 +1,4 @@
-"""Which part of the body a vertex belongs to."""
+"""The parts of the body, and the part that each vertex belongs to."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def part_labels(body: BodyModel) -> Tensor:
 
 
 def is_part(body: BodyModel, *names: str) -> Tensor:
-    """Whether each vertex belongs to one of the named parts: [V] bool.
+    """True for vertices of the named parts: [V] bool.
 
     Raises:
         ValueError: there is no part of that name.
@@ -41,7 +41,7 @@ def is_part(body: BodyModel, *names: str) -> Tensor:
 
 
 def is_face(body: BodyModel) -> Tensor:
-    """Whether each vertex lies on the face, eyes and inner mouth down to the throat included: [V] bool.
+    """True for vertices of the face, eyes and inner mouth down to the throat included: [V] bool.
 
     The face is what follows the head, the jaw or an eye, lies in front of the jaw's hinge, and rises
     above the eyes by at most 0.6 of what the chin lies below them: on the open body from the chin to

@@ -61,7 +61,7 @@ def posed_joints(
     joints: Tensor,  # [55, 3]
     parents: tuple[int, ...],
 ) -> Tensor:
-    """Where the joints are in a pose, without ``transl``: [T, 55, 3], metres."""
+    """The joints' positions in a pose, without ``transl``: [T, 55, 3], metres."""
     return _world_joints(roma.rotvec_to_rotmat(rotation), joints, parents)[1]
 
 

@@ -50,7 +50,7 @@ class Box:
         return Box(self.left - room, self.top - room, self.right + room, self.bottom + room)
 
     def clipped(self, width: int, height: int) -> Box:
-        """What of it lies in a picture."""
+        """The part of it that lies in a picture."""
         return Box(max(0, self.left), max(0, self.top), min(width, self.right), min(height, self.bottom))
 
 

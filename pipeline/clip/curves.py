@@ -12,7 +12,7 @@ from pipeline.files.tables import read_table, write_table
 
 SCHEMA = pa.schema([("iteration", pa.int32()), ("name", pa.string()), ("value", pa.float32())])
 
-Line = list[tuple[int, float]]
+CurvePoints = list[tuple[int, float]]
 """(iteration, value), in the order of the iterations."""
 
 
@@ -60,14 +60,14 @@ class Curve:
         write_table(path, SCHEMA, columns)
 
 
-def read_curve(path: Path, remedy: str) -> dict[str, Line]:
+def read_curve(path: Path, remedy: str) -> dict[str, CurvePoints]:
     """Name -> line of a curve's file.
 
     Raises:
         UserError: the file is missing or damaged; the message ends with ``remedy``.
     """
     columns = read_table(path, SCHEMA, remedy)
-    lines: dict[str, Line] = {}
+    lines: dict[str, CurvePoints] = {}
     rows = zip(*(columns[name].tolist() for name in SCHEMA.names), strict=True)
     for iteration, name, value in rows:
         lines.setdefault(name, []).append((iteration, value))

@@ -28,10 +28,9 @@ from pipeline.body import (
 )
 from pipeline.clip.boxes import Box, clip_box
 from pipeline.clip.camera import Camera
-from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.frames import read_frame, read_mask, spread_from_start
 from pipeline.clip.keypoints import Keypoints, read_keypoints
 from pipeline.clip.records import Footage, Split, read_cameras, read_footage, read_split
-from pipeline.clip.spread import spread_from_start
 from pipeline.clip.views import View, ViewCache, cropped
 from pipeline.errors import UserError
 

@@ -1,23 +1,30 @@
-"""Pictures on disk: numbered frames and masks as 8-bit PNG, and video that a browser plays.
+"""Frames of a clip: numbered pictures on disk, video that a browser plays, and an even choice of them.
 
 ``<folder>/<number:06d>.png`` where the number is the frame's place in the source clip. Frames are RGB
 in the clip's own (gamma-encoded) colours; masks are grey, 255 where the pixel is wholly the person's.
+
+Two rules choose frames, because the frames that each has chosen are in published results. They agree on how
+many, and differ at the end: ``spread_from_start`` takes the first of each of ``count`` equal parts, and never
+the last item; ``spread_end_to_end`` takes both ends and what lies evenly between.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from pipeline.errors import UserError
 
+Item = TypeVar("Item")
+
 
 def frame_path(folder: Path, index: int) -> Path:
-    """Where frame or mask number ``index`` lies."""
+    """The file of frame or mask number ``index``."""
     return folder / f"{index:06d}.png"
 
 
@@ -106,3 +113,27 @@ def _read(path: Path, flags: int) -> np.ndarray:
 def _check(image: np.ndarray, dimensions: int) -> None:
     if image.dtype != np.uint8 or image.ndim != dimensions:
         raise ValueError(f"expected uint8 with {dimensions} dimensions, not {image.dtype} {image.shape}")
+
+
+def spread_from_start(items: Sequence[Item], count: int) -> tuple[Item, ...]:
+    """At most ``count`` of the items, the first of each of as many equal parts; all if there are no more.
+
+    >>> spread_from_start(range(10), 4)
+    (0, 2, 5, 7)
+    """
+    if len(items) <= count:
+        return tuple(items)
+    return tuple(items[place * len(items) // count] for place in range(count))
+
+
+def spread_end_to_end(items: Sequence[Item], count: int) -> list[Item]:
+    """At most ``count`` of the items, evenly spaced, first and last included; the middle one if count is 1.
+
+    >>> spread_end_to_end(range(10), 4)
+    [0, 3, 6, 9]
+    """
+    if count >= len(items):
+        return list(items)
+    if count == 1:
+        return [items[len(items) // 2]]
+    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]

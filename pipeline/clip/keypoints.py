@@ -1,4 +1,4 @@
-"""What was detected of the person in each frame, and the table that it travels in.
+"""The keypoints detected in each frame, and their table.
 
 ``keypoints.parquet`` has one row a kept frame, sorted by frame number:
 

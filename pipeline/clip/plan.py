@@ -15,10 +15,10 @@ import math
 from pathlib import Path
 from typing import Any, get_args
 
-from pipeline.clip.records import read_json
 from pipeline.config.choices import BodyPart
 from pipeline.errors import UserError
 from pipeline.files.json_files import write_json
+from pipeline.untrusted import parse_json
 
 GATHERED = ("structure_from_motion", "face_registration")
 """Decided by ingest and by fit, which publish what the plan needs to know of it."""
@@ -38,7 +38,7 @@ DECIDED = (
 """Decided by the plan stage, which has a setting (``on``, ``off`` or ``auto``) of each name."""
 
 SEEN_PARTS = tuple(f"seen_{part}" for part in get_args(BodyPart))
-"""Whether a part of the body is ever seen; measured as the share of training frames that show it."""
+"""One for each part of the body: is it ever seen? Measured as the share of training frames that show it."""
 
 EFFECTS = (*GATHERED, *DECIDED, *SEEN_PARTS)
 
@@ -103,7 +103,7 @@ class Plan:
         raise KeyError(effect)
 
     def on(self, effect: str) -> bool:
-        """Whether an effect is built."""
+        """True where an effect is built."""
         return self[effect].on
 
 
@@ -119,7 +119,7 @@ def read_plan(path: Path) -> Plan:
     Raises:
         UserError: it is missing, malformed, lacks an effect or names one that does not exist.
     """
-    content = read_json(path, _REMEDY)
+    content = parse_json(path, _REMEDY)
     rows = content.get("decisions") if isinstance(content, dict) and set(content) == {"decisions"} else None
     if not isinstance(rows, list):
         raise UserError(f"{path}: must hold a list of decisions and nothing else: {_REMEDY}")

@@ -1,4 +1,4 @@
-"""The small records that travel between the stages: cameras, the split, what the footage was.
+"""The small records that travel between the stages: cameras, the split, the footage.
 
 ``cameras.parquet`` has one row a kept frame: ``frame``, ``width``, ``height`` (int32, pixels),
 ``intrinsics`` [9] and ``rotation`` [9] (float64, row by row) and ``translation`` [3] (float64, metres),
@@ -80,7 +80,7 @@ def read_cameras(path: Path, dtype: torch.dtype = torch.float32) -> dict[int, Ca
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Which frames are learnt from and which are held out; frame numbers, increasing, disjoint."""
+    """The frames to learn from and those held out; frame numbers, increasing, disjoint."""
 
     train: tuple[int, ...]
     test: tuple[int, ...]
@@ -97,7 +97,7 @@ def read_split(path: Path) -> Split:
     Raises:
         UserError: missing or malformed, no training frame, or a frame in both parts.
     """
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     parts = {}
     for name in ("train", "test"):
         frames = value.get(name) if isinstance(value, dict) else None
@@ -112,7 +112,7 @@ def read_split(path: Path) -> Split:
 
 @dataclasses.dataclass(frozen=True)
 class Footage:
-    """What the source was and what was kept of it.
+    """The source and the frames that were kept of it.
 
     Attributes:
         name: the source's file or folder name.
@@ -151,17 +151,8 @@ def write_footage(path: Path, footage: Footage) -> None:
 
 def read_footage(path: Path) -> Footage:
     """Read ``footage.json``; UserError where it is missing or malformed."""
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     names = {field.name for field in dataclasses.fields(Footage)}
     if not isinstance(value, dict) or set(value) != names:
         raise UserError(f"{path}: its fields are not {', '.join(sorted(names))}: {_REMEDY}")
     return Footage(**{**value, "seconds": tuple(value["seconds"])})
-
-
-def read_json(path: Path, remedy: str) -> Any:
-    """Read JSON.
-
-    Raises:
-        UserError: as ``untrusted.parse_json``: missing, too large, no JSON, NaN or an infinity.
-    """
-    return parse_json(path, remedy)

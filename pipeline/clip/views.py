@@ -1,4 +1,4 @@
-"""Frames as tensors with the camera that took them: what a rendering is compared with."""
+"""Frames as tensors with the camera that took them; renderings are compared with these."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose face it is: dlib's 128-number embedding (the paper's face consistency, supplement E.2).
+"""Recognition of faces by dlib's 128-number embedding (the paper's face consistency, supplement E.2).
 
 The paper compares ArcFace embeddings; dlib's stands in for it, since its weights can be had. Two faces
 of one person lie at most about 0.5 apart and those of two people at least about 0.66; cosines are
@@ -30,8 +30,8 @@ _LARGEST_PICTURE = 1200  # pixels of the longer side that the finder is shown
 
 
 @dataclasses.dataclass(frozen=True)
-class Face:
-    """One found face.
+class RecognizedFace:
+    """A face that was found, and its embedding.
 
     Attributes:
         box: of the picture.
@@ -42,7 +42,7 @@ class Face:
     embedding: np.ndarray
 
 
-class FaceReader:
+class FaceRecognizer:
     """Finds the largest face in a picture and embeds it."""
 
     def __init__(self, dlib_folder: Path, models: Path) -> None:
@@ -64,7 +64,7 @@ class FaceReader:
         self._align = dlib.shape_predictor(str(models / _POINTS))
         self._embed = dlib.face_recognition_model_v1(str(models / _RESNET))
 
-    def read(self, image: np.ndarray, box: Box | None = None) -> Face | None:
+    def read(self, image: np.ndarray, box: Box | None = None) -> RecognizedFace | None:
         """The face in ``image`` [H, W, 3] uint8 RGB, or None where the finder sees none.
 
         Args:
@@ -86,7 +86,7 @@ class FaceReader:
         sides = (face.left(), face.top(), face.right(), face.bottom())
         corner = (left, top, left, top)
         placed = (round(side / scale) + start for side, start in zip(sides, corner, strict=True))
-        return Face(Box(*placed), embedding)
+        return RecognizedFace(Box(*placed), embedding)
 
 
 def identity_distance(first: np.ndarray, second: np.ndarray) -> float:
@@ -103,7 +103,7 @@ def identity_cosine(first: np.ndarray, second: np.ndarray) -> float:
     return float(first @ second / length)
 
 
-def typical(embeddings: list[np.ndarray]) -> np.ndarray:
+def medoid(embeddings: list[np.ndarray]) -> np.ndarray:
     """The embedding with the least summed distance to the others: a real one, robust to a few bad faces.
 
     Raises:
@@ -116,7 +116,7 @@ def typical(embeddings: list[np.ndarray]) -> np.ndarray:
 
 
 def _scale(width: int, height: int) -> float:
-    """How far a picture is enlarged or shrunk for the finder, which knows no face under 80 pixels."""
+    """The factor by which a picture is resized for the finder, which knows no face under 80 pixels."""
     return min(max(1.0, 3 * _SMALLEST / min(width, height)), _LARGEST_PICTURE / max(width, height))
 
 

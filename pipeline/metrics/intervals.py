@@ -1,4 +1,4 @@
-"""How sure a mean over frames is: a bootstrap over blocks of neighbouring frames.
+"""Confidence intervals of means over frames, by a bootstrap over blocks of neighbouring frames.
 
 Neighbouring frames look alike, and so do their scores: drawing single frames anew would count each as a
 witness of its own and give intervals that are too narrow. Blocks of frames that follow one another are
@@ -76,7 +76,7 @@ def interval(
 
 
 def stretch(blocks: int, tail: float) -> float:
-    """How much wider an interval from a few blocks is than one from many; 1 for a single one, which has none.
+    """The factor by which an interval from a few blocks is wider than one from many; 1 for a single block.
 
     Args:
         blocks: how many.

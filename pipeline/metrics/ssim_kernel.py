@@ -199,7 +199,7 @@ def _add_row(row, factor, total):
 
 @checked_kernel
 def _gather_rows(slope, place, taps, total):
-    """What reaches row ``place`` of the image, mirrored ones included, down the columns."""
+    """The derivatives that reach row ``place`` of the image down the columns, mirrored rows included."""
     rows = slope.shape[0]
     total[:] = 0
     mirrored = (place, -place, 2 * (rows - 1) - place)

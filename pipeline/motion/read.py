@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pipeline.body import JOINT_NAMES, BodyModel, Identity, rest_joints
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.motion.amass import read_amass
 from pipeline.motion.bvh import read_bvh
 from pipeline.motion.fitted_motion import read_fitted

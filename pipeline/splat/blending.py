@@ -96,7 +96,7 @@ def _overload_exp_negative(sigma):
 
 @kernel
 def _base(k):
-    """Where the batch's record k begins in the buffer."""
+    """The place in the buffer at which the batch's record k begins."""
     return np.uint64(k) * np.uint64(_WIDTH)
 
 
@@ -123,7 +123,7 @@ def _start_tile(buffer, width, height, limits):
 
 @kernel
 def _all_ended(buffer, limits):
-    """Whether no pixel of the tile can take any more."""
+    """True where no pixel of the tile can take any more."""
     most = limits.zero
     for i in range(int(_T), int(_T) + _PIXELS):
         most = max(most, buffer[i])

@@ -1,4 +1,4 @@
-"""Every Gaussian at every pixel, in plain torch: what the other backends mean, written to be read.
+"""Every Gaussian at every pixel, in plain torch: the plain twin of the other backends.
 
 With its gradients it needs memory for some twenty [N, H, W] tensors. It runs in any floating dtype, on any
 device, and its derivatives are autograd's.
@@ -89,7 +89,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 @torch.no_grad()
 def usable(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Which Gaussians can be drawn: bool [N]. The rest would give nothing, or something not finite."""
+    """True for Gaussians that can be drawn, bool [N]; the rest show nothing or are not finite."""
     *vectors, opacities = gaussians.tensors()
     finite = torch.cat([*vectors, opacities[:, None]], 1).isfinite().all(1)
     lengths = gaussians.quaternions.norm(dim=1)
@@ -113,7 +113,7 @@ def usable(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def alphas(projected: Projected, opacities: Tensor, camera: Camera) -> Tensor:
-    """How much each Gaussian covers each pixel on its own: [N, H, W]."""
+    """Each Gaussian's alpha at each pixel, before any blending: [N, H, W]."""
     columns = torch.arange(camera.width, dtype=opacities.dtype, device=opacities.device)
     rows = torch.arange(camera.height, dtype=opacities.dtype, device=opacities.device)
     x = (columns + 0.5 - projected.means[:, :1])[:, None, :]  # [N, 1, W]

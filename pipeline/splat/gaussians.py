@@ -1,4 +1,4 @@
-"""What is rendered, and what a rendering is."""
+"""The renderer's input and output: Gaussians, and an image of them."""
 
 from __future__ import annotations
 

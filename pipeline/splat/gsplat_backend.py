@@ -81,7 +81,7 @@ def _rasterization() -> Callable[..., Any]:
 
 
 def missing_tools() -> list[str]:
-    """What gsplat needs to compile its CUDA code and this machine has not."""
+    """The tools that gsplat needs to compile its CUDA code and this machine lacks."""
     return [tool for tool, names in BUILD_TOOLS.items() if not any(map(shutil.which, names))]
 
 

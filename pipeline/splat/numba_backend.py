@@ -17,7 +17,7 @@ from pipeline.clip.camera import Camera
 from pipeline.numba_kernels import use_torch_threads
 from pipeline.splat.blending import Limits, blend_backward, blend_forward, make_limits, sum_weights
 from pipeline.splat.gaussians import Gaussians, Rendering
-from pipeline.splat.lens import Lens, make_lens
+from pipeline.splat.image_formation import Pinhole, make_pinhole
 from pipeline.splat.projection import (
     CAMERA_CHUNKS,
     DEPTH,
@@ -36,13 +36,13 @@ def render_numba(gaussians: Gaussians, camera: Camera) -> Rendering:
         gaussians: all float32 or all float64.
         camera: its extrinsics in the same dtype.
     """
-    lens = make_lens(_array(camera.intrinsics), camera.width, camera.height)
+    lens = make_pinhole(_array(camera.intrinsics), camera.width, camera.height)
     return Rendering(*_Rasterize.apply(*gaussians.tensors(), camera.rotation, camera.translation, lens))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Drawing:
-    """What the backward pass needs of the forward pass.
+    """The results of the forward pass that the backward pass needs.
 
     Attributes:
         pose: the camera's rotation and translation, float64.
@@ -54,7 +54,7 @@ class _Drawing:
         weights: [N], as in ``Rendering``.
     """
 
-    lens: Lens
+    lens: Pinhole
     limits: Limits
     pose: tuple[np.ndarray, np.ndarray]
     tiles: Tiles
@@ -103,7 +103,7 @@ class _Rasterize(torch.autograd.Function):
         return *map(torch.from_numpy, gradients), g_pose[:9].reshape(3, 3), g_pose[9:], None
 
 
-def _draw(gaussians: list[np.ndarray], pose: tuple[np.ndarray, np.ndarray], lens: Lens) -> _Drawing:
+def _draw(gaussians: list[np.ndarray], pose: tuple[np.ndarray, np.ndarray], lens: Pinhole) -> _Drawing:
     """The forward pass: project, bin, blend."""
     count, dtype = len(gaussians[0]), gaussians[0].dtype
     width, height = int(lens.width), int(lens.height)

@@ -135,7 +135,7 @@ def _interval(centre, radius, size):
 
 @kernel
 def _has_image(mean, norm, scale, color, opacity, point, lens):
-    """Whether a Gaussian is finite and before the camera. Written so that NaN answers no.
+    """True for a Gaussian that is finite and before the camera. Written so that NaN gives False.
 
     Not with math.isfinite: it asks whether x - x equals itself, and "reassoc" cancels a sum against itself.
     """
@@ -154,7 +154,7 @@ def project_forward(
     Args:
         means, quaternions, scales, colors, opacities: as in ``Gaussians``, float32 or float64 alike.
         rotation: float64 [3, 3]; translation: float64 [3].
-        lens: a ``Lens``.
+        lens: a ``Pinhole``.
         tile: a tile's side, pixels.
         records: output [N, RECORD_WIDTH]; rows of Gaussians that are left out stay as they are.
         boxes: output int32 [N, 4], the tiles that a Gaussian can touch: first column, first row, end column,

@@ -1,4 +1,4 @@
-"""Which Gaussians each tile of the image may show, front to back, as numba kernels."""
+"""Lists of the Gaussians that each tile of the image may show, front to back, as numba kernels."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ from typing import Any
 
 import filelock
 
-from pipeline.error_messages import is_disk_full
-from pipeline.errors import UserError
+from pipeline.errors import UserError, is_disk_full
 from pipeline.files.json_files import write_json
 from pipeline.finite import require_finite_files
 from pipeline.store import digest

@@ -27,8 +27,8 @@ from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.config.assets import require
 from pipeline.files.json_files import json_text
 from pipeline.metrics import Lpips
-from pipeline.metrics.person_pixels import interior
 from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import interior
 from pipeline.metrics.ssim import ssim
 from pipeline.numba_kernels import threads
 from pipeline.run.job import Job

@@ -1,9 +1,8 @@
 """The clip's colours on the surface of the fitted body: gathered from frames, and painted into a view."""
 
-from pipeline.texture.paint import paint
-from pipeline.texture.projection import Seen, gather, robust_mean, weighted_median
+from pipeline.texture.projection import VertexColors, gather_colors, paint, robust_mean, weighted_median
 from pipeline.texture.surface import FineSurface, fine_surface
 
 __all__ = [
-    "FineSurface", "Seen", "fine_surface", "gather", "paint", "robust_mean", "weighted_median",
+    "FineSurface", "VertexColors", "fine_surface", "gather_colors", "paint", "robust_mean", "weighted_median",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the clip shows of each vertex: colours gathered from frames, and how far they can be trusted.
+"""The clip's colours on the body's surface: gathered from frames, and painted into a view.
 
 A frame counts by the angle at which it sees the surface and by its resolution there, and not at all
 where the surface is hidden, seen at a grazing angle, or within a few pixels of the mask's edge, where a
@@ -21,15 +21,16 @@ from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.texture.surface import FineSurface
 
-GRAZING = 0.25  # cosine of the angle between normal and view under which nothing is believed
+SAMPLES = 2  # a pixel, in each direction
+GRAZING = 0.25  # cosine of the angle between normal and view under which no colour is taken
 DEPTH = 0.012  # metres behind the nearest surface at which a vertex still counts as seen
-EDGE = 0.012  # of the person's height: what lies nearer to the mask's edge is not believed
+EDGE = 0.012  # of the person's height: no colour is taken nearer to the mask's edge
 AGREEING = 24.0  # of 255: samples within this distance of the median are averaged
 SURE = 0.02  # summed weight from which a vertex is known; a frontal view at full resolution weighs 1
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
+class VertexColors:
     """The clip's colours on the surface.
 
     Attributes:
@@ -46,12 +47,12 @@ class Seen:
 
 
 @torch.no_grad()
-def gather(
+def gather_colors(
     surface: FineSurface,
     clip: FittedClip,
     frames: Sequence[int],
     advance: Callable[[], object] = lambda: None,
-) -> Seen:
+) -> VertexColors:
     """The colours that some frames of a clip show of all vertices.
 
     Args:
@@ -67,17 +68,17 @@ def gather(
     for row, frame in enumerate(frames):
         vertices = clip.vertices(frame)
         pictures = clip.frame(frame), clip.mask(frame)
-        colors[row], weights[row] = look(surface, clip.camera(frame), vertices, *pictures)
+        colors[row], weights[row] = sample_frame(surface, clip.camera(frame), vertices, *pictures)
         normal += surface.refine(vertex_normals(vertices, surface.coarse)).numpy()
         advance()
     largest = weights.max()
     weights /= max(float(largest), 1e-12)
     color = robust_mean(colors, weights)
     weight = weights.sum(0)
-    return Seen(color, weight, weight > SURE, normal / np.float32(max(1, count)))
+    return VertexColors(color, weight, weight > SURE, normal / np.float32(max(1, count)))
 
 
-def look(
+def sample_frame(
     surface: FineSurface,
     camera: Camera,
     vertices: Tensor,  # [V, 3]
@@ -172,3 +173,39 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     padded = cv2.copyMakeBorder(solid, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     distance = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     return distance > band
+
+
+def paint(
+    camera: Camera,
+    surface: FineSurface,
+    vertices: Tensor,  # [V, 3]
+    carried: np.ndarray,  # [N, 3 + K]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The textured body as a camera sees it, on black.
+
+    Args:
+        camera: the view.
+        surface: the fine mesh.
+        vertices: the body's, posed, metres, in the world.
+        carried: the fine vertices' colours, in 0 to 255, and whatever else they carry.
+
+    Returns:
+        image [H, W, 3] uint8, not premultiplied; mask [H, W] uint8; and what else is carried,
+        [H, W, K] float32, averaged over the part of the pixel that the body covers.
+    """
+    size = (camera.width, camera.height)
+    fine = camera.resized(size[0] * SAMPLES, size[1] * SAMPLES)
+    raster = rasterize(fine, surface.refine(vertices), surface.faces)
+    samples = raster.interpolate(surface.faces.numpy(), carried)
+    samples = np.concatenate([samples, raster.covered[..., None].astype(np.float32)], axis=-1)
+    pixels = _shrunk(samples, size)
+    alpha = pixels[..., -1:]
+    over = pixels[..., :-1] / np.maximum(alpha, 1e-6)
+    image = np.clip(np.round(over[..., :3]), 0, 255).astype(np.uint8)
+    return image, np.round(alpha[..., 0] * 255).astype(np.uint8), over[..., 3:]
+
+
+def _shrunk(samples: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Means of ``SAMPLES`` squared samples: [H S, W S, C] -> [H, W, C]."""
+    width, height = size
+    return samples.reshape(height, SAMPLES, width, SAMPLES, -1).mean((1, 3))

@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body import PARTS, BodyModel, is_face, joint_index, part_labels
-from pipeline.body.mesh import edges_of_faces
-from pipeline.body.subdivision import subdivide
+from pipeline.body.mesh import edges_of_faces, subdivide
 
 _EARS = 0.03  # metres behind the jaw's hinge, as far as the ears reach
 

@@ -6,18 +6,16 @@ Datasets are downloads. Everything that the project reads from one goes through 
 ``pickles``   pickles and torch files: arrays, tensors and plain containers; other names are refused
 ``stubs``     what a pickle is made of while it is read, and the arrays that become of it
 ``arrays``    ``.npy`` and ``.npz``, also with objects in them
-``pictures``  the size that a picture claims, looked at before it is decoded
 ``text``      JSON and plain lists: bounded, without NaN
-``paths``     names in files that must stay inside their folder; sizes
+``bounds``    names that must stay inside their folder; sizes of files, archives and pictures
 ============  =====================================================================================
 
 Sizes are bounded before memory is taken, and every error names the file and the remedy.
 """
 
 from pipeline.untrusted.arrays import read_npy, read_npz
-from pipeline.untrusted.paths import GIGABYTE, bounded_bytes, inside
+from pipeline.untrusted.bounds import GIGABYTE, bounded_bytes, check_picture, inside
 from pipeline.untrusted.pickles import parse_pickle, parse_pickled_arrays, read_pickle, read_torch
-from pipeline.untrusted.pictures import check_picture
 from pipeline.untrusted.text import parse_json, read_lines, read_numbers
 
 __all__ = [

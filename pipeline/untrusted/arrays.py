@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.untrusted.paths import GIGABYTE, bounded_bytes, check_unpacked
+from pipeline.untrusted.bounds import GIGABYTE, bounded_bytes, check_unpacked
 from pipeline.untrusted.pickles import parse_pickle
 
 _MOST_HEADER = 100_000  # bytes

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.untrusted.paths import GIGABYTE, bounded_bytes, check_unpacked
+from pipeline.untrusted.bounds import GIGABYTE, bounded_bytes, check_unpacked
 from pipeline.untrusted.stubs import (
     Array,
     Buffer,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.untrusted.paths import bounded_bytes
+from pipeline.untrusted.bounds import bounded_bytes
 
 MOST_BYTES = 256 << 20  # the largest that is known, an INSTA transforms.json, has some MB
 MOST_KEYS = 500_000  # of all objects together; a dataset's index has a few a frame

@@ -71,7 +71,7 @@ class Actor:
         seen = source.gaussians(pose, time=None, theta=theta)
         if self.extra is None:
             return seen
-        bare = self.avatar.bare(self.extra, pose)
+        bare = self.avatar.base_gaussians(self.extra, pose)
         return Gaussians(*(torch.cat(pair) for pair in zip(seen.tensors(), bare.tensors(), strict=True)))
 
 
@@ -98,5 +98,5 @@ def legs_share(avatar: Avatar, body: BodyModel) -> float:
     """The share of the body's legs that the avatar has Gaussians for."""
     labels = part_labels(body).long()
     legs = torch.isin(labels, torch.tensor([PARTS.index(name) for name in _LEGS]))
-    kept = avatar.kept[avatar.active.cpu()]
+    kept = avatar.vertex_ids[avatar.active.cpu()]
     return float(legs[kept].sum()) / max(float(legs.sum()), 1.0)

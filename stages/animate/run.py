@@ -15,9 +15,8 @@ from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over, to_bytes
-from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.records import read_cameras, read_split, write_cameras
-from pipeline.clip.spread import spread_end_to_end
 from pipeline.files.json_files import write_json
 from pipeline.motion.motion import Span
 from pipeline.motion.motion_name import TURNTABLE, motion_name

@@ -10,7 +10,7 @@ import torch
 
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.motion.motion import Motion
 from pipeline.motion.placement import Placed
 from pipeline.orbit_cameras import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body import rasterize
-from pipeline.body.mesh import Raster
+from pipeline.body.rasterize import Raster
 from pipeline.clip.boxes import Box
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip

@@ -23,11 +23,12 @@ import torch
 from pipeline.body import Poses, read_poses, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frames import spread_from_start
 from pipeline.clip.keypoints import COUNT
-from pipeline.clip.records import read_cameras, read_json
-from pipeline.clip.spread import spread_from_start
+from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
 from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
+from pipeline.untrusted import parse_json
 from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.turn import ID_OFFSET, Turn
 
@@ -130,7 +131,7 @@ def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Ite
 
 
 def _peer_camera(path: Path, size: tuple[int, ...]) -> Camera:
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     try:
         rotation, translation = np.array(value["R"], float), np.array(value["t"], float).reshape(3)
         focal, centre = (np.array(value[name], float).reshape(2) for name in ("focal", "princpt"))
@@ -217,7 +218,7 @@ def _listed(path: Path) -> set[int] | None:
 
 
 def _whole_body(path: Path) -> np.ndarray:
-    value = read_json(path, _REMEDY)
+    value = parse_json(path, _REMEDY)
     try:
         points = np.array(value, np.float32)
     except (TypeError, ValueError):

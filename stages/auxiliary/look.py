@@ -13,7 +13,7 @@ from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE
 from pipeline.detection.mediapipe import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels
-from pipeline.metrics.face_identity import FaceReader, typical
+from pipeline.metrics.face_identity import FaceRecognizer, medoid
 from stages.auxiliary.offer import Picture
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Watcher:
         """Load the estimator and the face reader."""
         log = context.work / "mediapipe.log"
         self._estimator = Estimator(context.assets["mediapipe"], log, still=True)
-        self._faces = FaceReader(context.assets["dlib"], context.assets["identity"])
+        self._faces = FaceRecognizer(context.assets["dlib"], context.assets["identity"])
 
     def look(self, picture: Picture) -> Look:
         """What is seen in one frame."""
@@ -101,7 +101,7 @@ class Watcher:
         for frame in best:
             found.append(self.embedding(clip.frame(frame), points[index(frame)]))
         known = [one for one in found if one is not None]
-        return typical(known) if known else None
+        return medoid(known) if known else None
 
 
 def fused(estimate: Estimate | None, width: int, height: int) -> np.ndarray:

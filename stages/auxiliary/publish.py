@@ -13,10 +13,9 @@ from pipeline.body import posed_vertices, write_poses
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite
 from pipeline.clip.fitted_clip import FittedClip
-from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask, write_png
+from pipeline.clip.frames import read_frame, read_mask, spread_from_start, write_frame, write_mask, write_png
 from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras
-from pipeline.clip.spread import spread_from_start
 from pipeline.files.json_files import write_json
 from pipeline.pictures import side_by_side
 from stages.auxiliary.accept import Accepted

@@ -48,7 +48,7 @@ def run(context: Context) -> None:
     turn, surface = make_turn(clip, settings), texture.fine_surface(clip.body, settings.texture_levels)
     frames = clip.spread(settings.texture_frames)
     with context.progress(len(frames), "texture") as progress:
-        seen = texture.gather(surface, clip, frames, progress.advance)
+        seen = texture.gather_colors(surface, clip, frames, progress.advance)
     colors, framing = texture.complete(surface, seen, settings.texture_light), find_framing(clip)
     context.log(f"the clip shows {seen.known.mean():.0%} of the surface")
     if generator != "texture" or settings.texture_guidance:

@@ -14,7 +14,7 @@ from torch import Tensor
 from pipeline.body import JOINT_NAMES, Poses, posed_vertices, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.errors import UserError
 from stages.auxiliary.settings import AuxiliarySettings
 

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache, partial
 import torch
 from torch import Tensor
 
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import MEAN, NEAREST, OnBackground
 

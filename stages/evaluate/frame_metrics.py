@@ -21,10 +21,10 @@ from pipeline.clip.boxes import Box
 from pipeline.clip.composite import BACKGROUNDS, BLACK, WHITE, cut_out, to_bytes
 from pipeline.config.evaluation_protocol import OWN, TRUTH
 from pipeline.finite import require_finite
-from pipeline.metrics.face_identity import Face, identity_cosine, identity_distance
+from pipeline.metrics.face_identity import RecognizedFace, identity_cosine, identity_distance
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.person_pixels import interior, person
 from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import interior, person
 from pipeline.metrics.ssim import ssim
 from stages.evaluate.methods import OnBackground
 
@@ -32,9 +32,9 @@ FACE_MARGIN = 0.5  # of the face crop's size, around it, for the face finder
 
 
 class FaceEmbedder(Protocol):
-    """Finds and embeds a face; :class:`pipeline.metrics.face_identity.FaceReader` is one."""
+    """Finds and embeds a face; :class:`pipeline.metrics.face_identity.FaceRecognizer` is one."""
 
-    def read(self, image: np.ndarray, box: Box | None = None) -> Face | None:
+    def read(self, image: np.ndarray, box: Box | None = None) -> RecognizedFace | None:
         """The face in [H, W, 3] uint8 RGB, or None."""
 
 
@@ -116,7 +116,7 @@ class Scorer:
         Args:
             picture: what is scored.
             truth: the person.
-            interior: [H, W] bool, see :func:`pipeline.metrics.person_pixels.interior`.
+            interior: [H, W] bool, see :func:`pipeline.metrics.regions.interior`.
             person: [H, W] bool, the person's pixels; without ``psnr_person`` if None.
 
         Returns:

@@ -28,14 +28,13 @@ from pipeline.body import (
     read_identity,
     read_poses,
 )
-from pipeline.body.mesh import Raster
+from pipeline.body.rasterize import Raster
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame
-from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.frames import read_frame, read_mask, spread_end_to_end
 from pipeline.clip.records import read_cameras
-from pipeline.clip.spread import spread_end_to_end
-from pipeline.metrics.person_pixels import interior, person
 from pipeline.metrics.psnr import psnr
+from pipeline.metrics.regions import interior, person
 from pipeline.metrics.ssim import ssim
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import AvatarMethod, OnBackground

@@ -14,13 +14,12 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose
 from pipeline.clip.curves import read_curve
-from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
-from pipeline.clip.spread import spread_end_to_end
 from pipeline.config.settings import as_dict
 from pipeline.metrics import Lpips
-from pipeline.metrics.face_identity import FaceReader
+from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
 from pipeline.run.job import peak_memory, shown
@@ -102,7 +101,7 @@ def run(context: Context) -> None:
         scorer,
         mesh=mesh,
         second=second_mask(context, clip),
-        embedder=FaceReader(context.assets["dlib"], context.assets["identity"])
+        embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),

@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 from torch import Tensor
 
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.files.tables import write_table
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.regions import region_boxes

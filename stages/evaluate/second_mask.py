@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from pipeline.clip.composite import composite_frame
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.detection.mediapipe import Estimator, estimator_scale, resize
 from pipeline.errors import UserError
 from stages.evaluate.evaluated_clip import EvaluatedClip

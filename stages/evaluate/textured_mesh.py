@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite_frame
-from pipeline.texture import FineSurface, fine_surface, gather, paint
+from pipeline.texture import FineSurface, fine_surface, gather_colors, paint
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import MESH, OnBackground
 
@@ -63,7 +63,7 @@ def textured_mesh(
         advance: called after each frame.
     """
     surface = fine_surface(clip.body, LEVELS)
-    seen = gather(surface, clip, frames, advance)
+    seen = gather_colors(surface, clip, frames, advance)
     template = surface.refine(clip.body.v_template).numpy()
     colors = nearest_known(seen.color, seen.known, template)
     return TexturedMesh(clip, surface, colors, float(seen.known.mean()))

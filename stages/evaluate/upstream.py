@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.clip.records import read_json
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table
 from pipeline.store.artifact import MANIFEST, RUN
+from pipeline.untrusted import parse_json
 
 VISIBILITY = pa.schema([("captured", pa.float32()), ("kept", pa.bool_())])
 """The columns of train's visibility.parquet that are read: each body vertex's score, and whether it carries
@@ -104,7 +104,7 @@ def read_gate(train: Path) -> GateRecord:
     """
     remedy = "run the train stage again"
     table = read_table(train / "visibility.parquet", VISIBILITY, remedy)
-    found = read_json(train / "gate.json", remedy)
+    found = parse_json(train / "gate.json", remedy)
     if not isinstance(found, dict) or not {"tau", "why", "definition"} <= set(found):
         raise UserError(f"{train / 'gate.json'} has no threshold: {remedy}")
     kept = table["kept"]
@@ -129,7 +129,7 @@ def _number(value: Any) -> float | None:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        content = read_json(path, "")
+        content = parse_json(path, "")
     except UserError:
         return {}
     return content if isinstance(content, dict) else {}

@@ -24,10 +24,9 @@ from pipeline.body import (
     write_poses,
 )
 from pipeline.clip.camera import Camera
-from pipeline.clip.frames import write_png, write_video
+from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.keypoints import read_keypoints
 from pipeline.clip.records import read_cameras, read_footage
-from pipeline.clip.spread import spread_end_to_end
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
 from pipeline.numba_kernels import threads

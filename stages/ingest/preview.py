@@ -7,9 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.clip.frames import read_frame, read_mask, write_png
+from pipeline.clip.frames import read_frame, read_mask, spread_end_to_end, write_png
 from pipeline.clip.keypoints import BODY, FACE, FEET, LEFT_HAND, RIGHT_HAND, Keypoints
-from pipeline.clip.spread import spread_end_to_end
 from pipeline.pictures import contact_sheet
 
 COLOURS = ((BODY, (255, 80, 60)), (FEET, (255, 170, 40)), (FACE, (250, 240, 90)), (LEFT_HAND, (80, 220, 255)),

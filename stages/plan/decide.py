@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.avatar.visibility import LEAST_CUT, evidence_threshold
+from pipeline.avatar.otsu_threshold import LEAST_CUT, evidence_threshold
 from pipeline.body import rest_joints
 from pipeline.clip.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
 from stages.plan.measure import (

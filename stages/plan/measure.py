@@ -22,9 +22,9 @@ from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.clip.plan import AZIMUTH_STEP
-from pipeline.clip.records import read_json
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table
+from pipeline.untrusted import parse_json
 
 TRUSTED = 0.4  # score from which a keypoint is believed, as in Eq. 2
 SHOWN = 0.5  # share of a part's points that a frame must show
@@ -77,7 +77,7 @@ def _errors(path: Path) -> dict[int, float]:
 
 
 def _face(path: Path) -> dict[str, Any]:
-    content = read_json(path, "run the fit stage again")
+    content = parse_json(path, "run the fit stage again")
     if not isinstance(content, dict) or set(content) != {"source", "frames", "registered"}:
         raise UserError(f"{path} is not what fit says of the face: run the fit stage again")
     return content

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Canonical
-from pipeline.body.mesh import face_normals, rasterize
+from pipeline.body.mesh import face_normals
+from pipeline.body.rasterize import rasterize
 from pipeline.clip.camera import Camera, project, to_camera
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.clip.spread import spread_from_start
+from pipeline.clip.frames import spread_from_start
 from pipeline.errors import UserError
 from stages.train.data import TrainingData
 from stages.train.initial_colors import initial_color_logits

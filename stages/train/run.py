@@ -118,7 +118,7 @@ def add_run_hooks(
         The curve, and the timer of the iterations.
     """
     settings, clip, poses = trainer.settings, trainer.data.clip, trainer.data.poses
-    key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.kept])
+    key = run_key(as_dict(settings), [poses.rotation, poses.transl, trainer.avatar.vertex_ids])
     shown = clip.spread(settings.held_out_frames, "test") if settings.held_out_frames else ()
     timer = TrainingTimer(work, compiled)
     curve = HeldOutCurve(shown, shown or clip.spread(WATCHED), timer, log)

@@ -5,7 +5,7 @@ That is measured for gated vertices as for all others, by posing the bare body, 
 
 The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
-the captured frames' scores (:mod:`pipeline.avatar.visibility`) and what lies below it is gated: it leaves
+the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
 that a region that comes into view later returns.
 
@@ -29,7 +29,8 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.avatar.visibility import Threshold, body_in_frame, evidence_threshold, fixed_threshold
+from pipeline.avatar.otsu_threshold import Threshold, evidence_threshold, fixed_threshold
+from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import Pose
 from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
@@ -78,7 +79,7 @@ class VisibilityGate(nn.Module, Hook):
         """
         super().__init__()
         self._avatar, self._vertices, self._settings = (avatar,), vertices, settings
-        for name, shape in (("hits", (2, len(avatar.kept))), ("drawn", (2,))):
+        for name, shape in (("hits", (2, len(avatar.vertex_ids))), ("drawn", (2,))):
             for suffix in ("", "_at_threshold"):
                 counts = torch.zeros(shape, dtype=torch.long, device=avatar.device)
                 self.register_buffer(name + suffix, counts)
@@ -113,7 +114,7 @@ class VisibilityGate(nn.Module, Hook):
     def whole_body(self, values: Tensor) -> np.ndarray:
         """Values of the avatar's vertices, [K], spread over the whole body, [V] float64; elsewhere 0."""
         whole = torch.zeros(self._vertices, dtype=torch.float64)
-        whole[self.avatar.kept] = values.double().cpu()
+        whole[self.avatar.vertex_ids] = values.double().cpu()
         return whole.numpy()
 
     def due(self, iteration: int) -> bool:
@@ -184,7 +185,7 @@ def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: ViewCache, frame
         views: the cameras.
         frames: frame numbers.
     """
-    seen = torch.zeros(len(avatar.kept), dtype=torch.bool, device=avatar.device)
+    seen = torch.zeros(len(avatar.vertex_ids), dtype=torch.bool, device=avatar.device)
     for frame in frames:
         camera = moved(views.camera(frame), avatar.device)
         seen |= body_in_frame(avatar.surfaces[0], poses.fitted(frame), camera)

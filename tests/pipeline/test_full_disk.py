@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from pipeline.clip.frames import write_png
-from pipeline.error_messages import explain, is_disk_full, size
+from pipeline.errors import error_message, is_disk_full, readable_size
 from pipeline.files.tables import write_table
 from pipeline.run.job import open_job, run_stage
 from pipeline.store.artifact import Store
@@ -83,7 +83,7 @@ def test_a_disk_that_fills_at_any_moment_leaves_nothing_half_published(toy, smal
             make(toy, "paint", "paint.iterations=2000", *words)
             outcomes.add("done")
         except OSError as error:
-            said = explain(error, store)
+            said = error_message(error, store)
             assert "the disk is full" in said and "of 256.0 KiB free" in said, said
             assert str(small_disk) in said and "artifacts=FOLDER" in said and "the same command" in said
             assert not list((store / "ann" / "paint").glob(".scratch-*/output/*"))  # its room is given back
@@ -106,7 +106,7 @@ def test_a_full_disk_at_the_last_step_of_publishing(toy, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(OSError) as caught:
         patch.setattr(os, "fsync", full)
         make(toy, "bend")
-    said = explain(caught.value, toy.store)
+    said = error_message(caught.value, toy.store)
     assert said.startswith((str(toy.store), "/")) and "the disk is full" in said and " free)" in said
     assert toy.published("bend", "ann") == [] and not list(toy.store.glob("ann/bend/.scratch-*/output"))
     make(toy, "bend")
@@ -133,22 +133,26 @@ def test_the_same_command_goes_on_when_there_is_room_again(toy, small_disk):
     ],
 )
 def test_a_full_disk_in_other_words(error, tmp_path):
-    assert is_disk_full(error) and "the disk is full" in explain(error, tmp_path)
+    assert is_disk_full(error) and "the disk is full" in error_message(error, tmp_path)
     try:
         try:
             raise error
         except Exception as first:
             raise RuntimeError("cannot write") from first
     except RuntimeError as later:
-        assert "the disk is full" in explain(later, tmp_path)
+        assert "the disk is full" in error_message(later, tmp_path)
 
 
 def test_other_errors_are_not_taken_for_a_full_disk(tmp_path):
-    assert explain(ValueError("ours"), tmp_path) is None
-    assert explain(FileNotFoundError(2, "No such file", "x"), tmp_path) is None
-    outside = explain(PermissionError(13, "Permission denied", "/etc/shadow"), tmp_path)
+    assert error_message(ValueError("ours"), tmp_path) is None
+    assert error_message(FileNotFoundError(2, "No such file", "x"), tmp_path) is None
+    outside = error_message(PermissionError(13, "Permission denied", "/etc/shadow"), tmp_path)
     assert "/etc/shadow: cannot be used" in outside and "artifacts" not in outside
-    assert (size(0), size(1536), size(5 * 1024**3)) == ("0 bytes", "1.5 KiB", "5.0 GiB")
+    assert (readable_size(0), readable_size(1536), readable_size(5 * 1024**3)) == (
+        "0 bytes",
+        "1.5 KiB",
+        "5.0 GiB",
+    )
 
 
 def test_a_data_folder_that_cannot_be_written(toy):
@@ -190,4 +194,4 @@ def write_arrays(path):
 def test_every_library_that_writes_says_that_the_disk_is_full(small_disk, write):
     with pytest.raises(Exception) as caught:
         write(small_disk / "file")
-    assert "the disk is full" in explain(caught.value, small_disk)
+    assert "the disk is full" in error_message(caught.value, small_disk)

@@ -16,7 +16,7 @@ import torch
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.avatar.visibility import (
+from pipeline.avatar.otsu_threshold import (
     LARGEST_LOSS,
     evidence_threshold,
     histogram,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Avatar
-from pipeline.avatar.visibility import (
+from pipeline.avatar.otsu_threshold import (
     BINS,
     LARGEST_LOSS,
     LEAST_CUT,
@@ -16,8 +16,8 @@ from pipeline.avatar.visibility import (
     share_below,
 )
 from pipeline.body import load_body, mean_identity
-from pipeline.clip.records import read_json
 from pipeline.errors import UserError
+from pipeline.untrusted import parse_json
 from stages.train import run as stage
 from stages.train.visibility_gate import VisibilityGate
 from tests.stability.test_skinning import SMALL
@@ -110,7 +110,7 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
     assert np.isfinite(list(values.values())).all()
     (tmp_path / "written").mkdir()
     trainer.hooks["gate"].write(tmp_path / "written")
-    assert read_json(tmp_path / "written" / "gate.json", "")["tau"] == 0
+    assert parse_json(tmp_path / "written" / "gate.json", "")["tau"] == 0
 
 
 def test_an_avatar_without_any_point_is_refused():

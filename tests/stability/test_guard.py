@@ -11,8 +11,7 @@ from safetensors.torch import save_file
 
 from pipeline import finite as guard
 from pipeline.body import Poses, write_poses
-from pipeline.error_messages import explain
-from pipeline.errors import UserError
+from pipeline.errors import UserError, error_message
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
 from pipeline.finite import NotFiniteError, finite, require_finite, require_finite_files
@@ -24,7 +23,7 @@ KEY = "0123456789abcdef"
 
 
 def test_it_is_an_error_that_a_user_reads(tmp_path):
-    assert explain(NotFiniteError("said"), tmp_path) == "said"
+    assert error_message(NotFiniteError("said"), tmp_path) == "said"
     assert issubclass(NotFiniteError, UserError) and issubclass(NotFiniteError, ValueError)
 
 

@@ -231,18 +231,18 @@ def test_the_kernels_of_posing_agree_with_torch_in_extreme_poses(body, turn):
         0
     ]
     points, transl = surface.canonical.vertices, torch.tensor([0.0, 0.0, -2.0])
-    means, quaternions = surface.rig.place(transforms, points, transl)
-    expected_means, expected = plain_place(surface.rig, transforms, points, transl)
+    means, quaternions = surface.skinning_tables.place(transforms, points, transl)
+    expected_means, expected = plain_place(surface.skinning_tables, transforms, points, transl)
     torch.testing.assert_close(means, expected_means, rtol=1e-4, atol=1e-5)
     # A quaternion and its opposite are one rotation; where opposite turns are blended neither is known well.
     same = (quaternions * expected).sum(1).abs()
     assert quaternions.isfinite().all() and (same > 0.999).float().mean() > 0.99
     torch.testing.assert_close(quaternions.norm(dim=1), torch.ones(len(points)), rtol=0, atol=1e-4)
-    normals = surface.rig.normals(transforms, points)
+    normals = surface.skinning_tables.normals(transforms, points)
     assert normals.isfinite().all()
     length = normals.norm(dim=1)
     assert (((length - 1).abs() < 1e-3) | (length < 1e-3)).all()
-    assert plain_normals(surface.rig, transforms, points).isfinite().all()
+    assert plain_normals(surface.skinning_tables, transforms, points).isfinite().all()
 
 
 @pytest.mark.parametrize("field", ["v_template", "weights", "shapedirs"])

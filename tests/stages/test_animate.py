@@ -13,11 +13,12 @@ from pipeline.body import PARTS, joint_index, load_body, mean_identity, pose_bod
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.splat import Gaussians, read_ply, render
+from pipeline.splat import Gaussians, render
 from stages.animate.actor import Known, legs_share
 from stages.animate.layers import decode_srgb, layers_of
 from stages.animate.run import on_background
 from tests.exr_reader import ffmpeg_colors, read_exr
+from tests.ply_reader import read_ply
 from tests.stages.animate_subject import awake_avatar, make_studio
 from tests.stages.train_subject import BODY_FILE, moving_poses
 from tests.unit.motion_files import FPS, made_up, write_npz

@@ -23,7 +23,7 @@ from pipeline.clip.keypoints import FACE, read_keypoints
 from pipeline.clip.plan import write_plan
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.texture import Seen, robust_mean, weighted_median
+from pipeline.texture import VertexColors, robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary import texture
 from stages.auxiliary.crop import find_framing
@@ -160,7 +160,7 @@ def test_the_unseen_side_is_the_mirror_of_the_seen_one():
     pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
     known = points[:, 0] > 0
     color, weight = np.where(known[:, None], pattern, 0).astype(np.float32), known.astype(np.float32)
-    seen = Seen(color, weight, known, np.zeros_like(points))
+    seen = VertexColors(color, weight, known, np.zeros_like(points))
     found = texture.complete(surface, seen)
     right = points[:, 0] < -0.02
     error = np.abs(found - pattern)[right]
@@ -178,7 +178,7 @@ def test_an_unseen_back_is_shaded_as_the_light_says():
     assert shade[known].max() - shade[known].min() == pytest.approx(0.34, abs=0.04)
     back = normal[:, 2] < -0.5
     assert shade[back] == pytest.approx(shade[known].min(), abs=0.02)
-    seen = Seen(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
+    seen = VertexColors(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
     assert np.median(texture.complete(surface, seen)[back]) < 165
     assert not shading(color, np.zeros(len(color)), normal, surface.part).any()
 
@@ -187,7 +187,7 @@ def test_projected_colours_are_those_of_the_frames(full):
     """The textured body in a frame of the clip looks like that frame."""
     clip = read(full)
     surface = texture.fine_surface(clip.body, 1)
-    seen = texture.gather(surface, clip, clip.split.train[:3])
+    seen = texture.gather_colors(surface, clip, clip.split.train[:3])
     colors = texture.complete(surface, seen)
     frame = clip.split.train[1]
     image, mask, _ = texture.paint(clip.cameras[frame], surface, clip.vertices(frame), colors)

@@ -11,12 +11,10 @@ from rich.console import Console
 
 from pipeline.body import Pose, Poses, write_poses
 from pipeline.clip.curves import read_curve
-from pipeline.clip.frames import write_mask, write_png
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end, write_mask, write_png
 from pipeline.errors import UserError
 from pipeline.metrics import PSNR_CAP
 from pipeline.orbit_cameras import relaxed_pose
-from pipeline.splat import read_ply
 from stages.evaluate import STAGE
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.report.plots import plot_training, plot_visibility
@@ -26,6 +24,7 @@ from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.upstream import VISIBILITY as VISIBILITY_READ
 from stages.evaluate.upstream import read_gate
 from stages.train.visibility_gate import SCHEMA as VISIBILITY
+from tests.ply_reader import read_ply
 from tests.stages.evaluate_subject import (
     FRAMES,
     HEIGHT,

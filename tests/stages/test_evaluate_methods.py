@@ -13,7 +13,7 @@ from pipeline.body import Poses, write_poses
 from pipeline.clip.frames import read_mask
 from pipeline.clip.records import read_cameras, write_cameras
 from pipeline.errors import UserError
-from pipeline.metrics.face_identity import Face
+from pipeline.metrics.face_identity import RecognizedFace
 from stages.evaluate import statistics
 from stages.evaluate.report.tables import camera_table
 from stages.evaluate.scores import TableRow, score_table
@@ -151,7 +151,7 @@ class Faces:
     def read(self, image, box=None):
         inside = box.clipped(image.shape[1], image.shape[0])
         mean = image[inside.slices].reshape(-1, 3).mean(0)
-        return Face(box, mean / 255) if mean.sum() > 60 else None
+        return RecognizedFace(box, mean / 255) if mean.sum() > 60 else None
 
 
 def test_faces_are_compared_frame_by_frame(clip):

@@ -7,7 +7,7 @@ import torch
 
 from pipeline.body import Pose
 from pipeline.clip.camera import project, to_camera
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.orbit_cameras import Extent, orbit, relaxed_pose, visible_extent
 from pipeline.splat import Gaussians
 from stages.evaluate.baselines import mean_frame, nearest_frames

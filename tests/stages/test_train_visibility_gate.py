@@ -9,8 +9,8 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.body import Pose, load_body
 from pipeline.clip.plan import Decision, Plan
-from pipeline.clip.records import read_json
 from pipeline.files.tables import read_table
+from pipeline.untrusted import parse_json
 from stages.train import run as stage
 from stages.train.checkpoint import NAME
 from stages.train.loop import Trainer
@@ -55,7 +55,7 @@ def test_scores_over_epochs_are_those_of_the_frames(subject, tmp_path, trainer):
 
 
 def test_warm_up_ends_when_it_should_and_what_is_gated_is_gone(trainer):
-    body = len(trainer.avatar.kept)
+    body = len(trainer.avatar.vertex_ids)
     for _ in range(2):
         trainer.step()
     assert trainer.hooks["gate"].threshold is None and len(trainer.avatar) == body
@@ -104,7 +104,7 @@ def test_laplacians_know_active_neighbours_only(trainer):
 
 def test_what_comes_into_view_later_returns(trainer):
     gate = trainer.hooks["gate"]
-    hand = torch.zeros(len(trainer.avatar.kept), dtype=torch.bool)
+    hand = torch.zeros(len(trainer.avatar.vertex_ids), dtype=torch.bool)
     hand[trainer.avatar.surfaces[0].canonical.is_part("left_hand")] = True
     gate.drawn[0] = 10
     gate.hits[0] = torch.where(trainer.avatar.surfaces[0].canonical.is_part("head", "face"), 10, 0)
@@ -168,7 +168,7 @@ def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tm
     monkeypatch.undo()
     stage.run(context)
     assert bytes_of(context.output) == bytes_of(whole.output)
-    found = read_json(context.output / "gate.json", "")
+    found = parse_json(context.output / "gate.json", "")
     assert found["drawn"] == {"captured": 12, "generated": 0} and found["tau"] > 0
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline.avatar.row_selection import put, take
+from pipeline.avatar.sparse import gather_rows, scatter_rows
 from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.regularisers import unmixed
 from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, body, one_thread  # noqa: F401
@@ -14,11 +14,11 @@ from tests.unit.test_train_losses import PATH
 
 def test_take_and_put_are_indexing_with_gradients():
     values, rows = torch.randn(6, 2, dtype=torch.float64, requires_grad=True), torch.tensor([4, 0, 3])
-    assert torch.equal(take(values, rows), values[rows])
-    back = put(values[:3], rows, 5)
+    assert torch.equal(gather_rows(values, rows), values[rows])
+    back = scatter_rows(values[:3], rows, 5)
     assert torch.equal(back[rows], values[:3]) and (back[[1, 2]] == 0).all()
-    assert torch.autograd.gradcheck(lambda x: take(x, rows), values)
-    assert torch.autograd.gradcheck(lambda x: put(x[:3], rows, 5), values)
+    assert torch.autograd.gradcheck(lambda x: gather_rows(x, rows), values)
+    assert torch.autograd.gradcheck(lambda x: scatter_rows(x[:3], rows, 5), values)
 
 
 @pytest.mark.parametrize("place", ["canonical", "posed"])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
-from pipeline.avatar.nearest_skinning import OWN, nearest_rows
+from pipeline.avatar.skinning_tables import OWN, nearest_rows
 from pipeline.body import Pose, load_body, mean_identity
 from pipeline.config.workspace import REPOSITORY
 
@@ -41,7 +41,7 @@ def test_reskinned_points_have_the_weights_of_the_nearest_vertex(body):
         avatar.reskin()
     points = decoded.surface.canonical.vertices + decoded.offset.detach()
     original, after = avatar.surfaces[0].canonical, avatar.surfaces[-1].canonical.skinning_weights
-    still = decoded.surface.pliable[:, 0] == 0
+    still = decoded.surface.pose_movable[:, 0] == 0
     assert bool(still.any()) and torch.equal(after[still], before[still])  # head and hands
     moved = torch.nonzero(~still)[::97, 0]
     nearest = torch.cdist(points[moved], original.vertices).argmin(1)

@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as functional
 
 from pipeline.avatar.sparse import SparsePair
-from pipeline.avatar.triplane import PLANES, Triplane, normalise, region_boxes, sampling
+from pipeline.avatar.triplane import PLANES, Triplane, bounding_boxes, normalise, sampling_matrix
 
 RESOLUTION, CHANNELS = 9, 4
 
@@ -28,7 +28,7 @@ def by_grid_sample(planes: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
 def test_sparse_product_equals_grid_sample_with_gradient():
     points, generator = drawn_points(), torch.Generator().manual_seed(2)
     triplane = Triplane(1, RESOLUTION, CHANNELS, generator)
-    samples = sampling(points, torch.zeros(len(points), dtype=torch.long), 1, RESOLUTION)
+    samples = sampling_matrix(points, torch.zeros(len(points), dtype=torch.long), 1, RESOLUTION)
     weights = torch.randn(len(points), 3 * CHANNELS, generator=generator)
     features = triplane(samples)
     (features * weights).sum().backward()
@@ -42,12 +42,12 @@ def test_sparse_product_equals_grid_sample_with_gradient():
 def test_each_region_reads_its_own_planes_in_its_own_box():
     points = drawn_points(60) * 0.3 + 1.0
     regions = (points[:, 0] > 1.0).long()
-    boxes = region_boxes(points, regions)
+    boxes = bounding_boxes(points, regions)
     coordinates = normalise(points, regions, boxes)
     assert coordinates.abs().max() < 1
     assert coordinates[regions == 1].abs().max() > 0.9
     triplane = Triplane(2, RESOLUTION, CHANNELS, torch.Generator().manual_seed(3))
-    features = triplane(sampling(coordinates, regions, 2, RESOLUTION))
+    features = triplane(sampling_matrix(coordinates, regions, 2, RESOLUTION))
     for region in (0, 1):
         mine = regions == region
         expected = by_grid_sample(triplane.planes[region], coordinates[mine])
@@ -68,5 +68,5 @@ def test_sparse_entries_at_one_place_add_up():
 def test_coordinates_outside_the_box_read_the_border(far):
     points = torch.tensor([[far, 0.1, 0.2]])
     triplane = Triplane(1, RESOLUTION, CHANNELS, torch.Generator().manual_seed(4))
-    features = triplane(sampling(points, torch.zeros(1, dtype=torch.long), 1, RESOLUTION))
+    features = triplane(sampling_matrix(points, torch.zeros(1, dtype=torch.long), 1, RESOLUTION))
     torch.testing.assert_close(features, by_grid_sample(triplane.planes[0], points), rtol=1e-5, atol=1e-7)

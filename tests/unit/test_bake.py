@@ -8,7 +8,7 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import bake
-from pipeline.avatar.fused_head import Layers, decode
+from pipeline.avatar.fused_head import HeadParameters, decode
 from pipeline.avatar.head import Head
 from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points, normals_of_vertices
 from pipeline.body import Pose, load_body, mean_identity, vertex_normals
@@ -126,7 +126,7 @@ def test_a_fused_head_is_the_head_with_gradients(inputs, width, groups):
     results = []
     for fused in (False, True):
         given = points.clone().requires_grad_()
-        layers = Layers.of(linear, norms)
+        layers = HeadParameters.of(linear, norms)
         shared = layers.biases[0] + head.condition(condition)
         layers = dataclasses.replace(layers, biases=(shared, *layers.biases[1:]))
         output = decode(given, layers, torch.float32) if fused else head(given, condition)

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from pipeline.body import edges, subdivide
-from pipeline.body.mesh import face_normals
-from pipeline.body.mouth import SMPLX_LIPS, SMPLX_VERTICES, close_mouth
+from pipeline.body.mesh import SMPLX_LIPS, SMPLX_VERTICES, close_mouth, face_normals
 
 RIM, EYE = 32, 546  # vertices on the rim of the hole, and of each eyeball
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.clip.boxes import SMALLEST, Box, clip_box, person_box
-from pipeline.clip.frames import write_mask
-from pipeline.clip.spread import spread_end_to_end, spread_from_start
+from pipeline.clip.frames import spread_end_to_end, spread_from_start, write_mask
 from pipeline.errors import UserError
 from pipeline.metrics.ssim import WINDOW
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.clip.composite import composite, composite_frame, cut_out, over
-from pipeline.metrics.person_pixels import person
+from pipeline.metrics.regions import person
 
 
 def test_over_by_hand():

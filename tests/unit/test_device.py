@@ -71,7 +71,7 @@ def avatar():
 
 
 def test_posing_in_plain_torch_is_that_of_the_kernels(avatar):
-    canonical, rig = avatar.surface().canonical, avatar.surface().rig
+    canonical, rig = avatar.surface().canonical, avatar.surface().skinning_tables
     transforms = joint_transforms(0.4 * drawn(1, 55, 3), canonical.joints, canonical.parents)[0]
     points, transl = canonical.vertices + 0.0002 * drawn(len(canonical), 3, seed=1), drawn(3, seed=2)
     torch.testing.assert_close(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.metrics.face_identity import FaceReader, identity_cosine, identity_distance, typical
+from pipeline.metrics.face_identity import FaceRecognizer, identity_cosine, identity_distance, medoid
 
 
 def test_distance_and_cosine():
@@ -18,16 +18,16 @@ def test_distance_and_cosine():
 
 def test_the_typical_face_is_a_real_one_and_no_outlier():
     faces = [np.array([0.0]), np.array([0.1]), np.array([0.2]), np.array([9.0])]
-    assert typical(faces)[0] in (0.1, 0.2)
+    assert medoid(faces)[0] in (0.1, 0.2)
     with pytest.raises(ValueError, match="no embeddings"):
-        typical([])
+        medoid([])
 
 
 def test_missing_models_name_the_remedy(tmp_path, assets_folder):
     if not (assets_folder / "dlib").is_dir():
         pytest.skip("the asset dlib is not there")
     with pytest.raises(UserError, match="doit run assets:identity"):
-        FaceReader(assets_folder / "dlib", tmp_path)
+        FaceRecognizer(assets_folder / "dlib", tmp_path)
 
 
 @pytest.mark.assets
@@ -38,7 +38,7 @@ def test_one_man_is_himself_and_not_the_other(assets_folder):
     for name in ("dlib", "identity", "smile", "carphone"):
         if not (assets_folder / name).is_dir():
             pytest.skip(f"the asset {name} is not there")
-    reader = FaceReader(assets_folder / "dlib", assets_folder / "identity")
+    reader = FaceRecognizer(assets_folder / "dlib", assets_folder / "identity")
     faces = {}
     for name, file in (("smile", "single_face.mp4"), ("carphone", "carphone_pristine.mp4")):
         with av.open(str(assets_folder / name / file)) as video:

@@ -15,7 +15,6 @@ from pipeline.clip.records import (
     Split,
     read_cameras,
     read_footage,
-    read_json,
     read_split,
     write_cameras,
     write_footage,
@@ -102,15 +101,3 @@ def test_footage_with_a_missing_field_is_refused(tmp_path: Path) -> None:
     (tmp_path / "footage.json").write_text('{"name": "x"}')
     with pytest.raises(UserError, match=r"footage\.json: its fields are not"):
         read_footage(tmp_path / "footage.json")
-
-
-@pytest.mark.parametrize("text", ["NaN", "[Infinity]", "[-Infinity]", "[1e999]", "{", ""])
-def test_json_without_finite_numbers_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "x.json").write_text(text)
-    with pytest.raises(UserError, match=r"x\.json is not readable JSON .*mend it"):
-        read_json(tmp_path / "x.json", "mend it")
-
-
-def test_missing_json_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"x\.json is missing: mend it"):
-        read_json(tmp_path / "x.json", "mend it")

@@ -1,12 +1,11 @@
-"""Gaussians to a .ply and back."""
+"""Gaussians to a .ply."""
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 
-from pipeline.errors import UserError
-from pipeline.splat import Gaussians, read_ply, render, write_ply
+from pipeline.splat import Gaussians, render, write_ply
+from tests.ply_reader import read_ply
 from tests.unit.splat_scene import scene
 
 PROPERTIES = (
@@ -37,12 +36,6 @@ def test_the_file_is_laid_out_as_viewers_expect(tmp_path):
     assert [first[f"rot_{k}"] for k in range(4)] == pytest.approx(unit.tolist())
 
 
-def test_another_library_reads_it(tmp_path):
-    gaussians, _ = scene(5, 8, 8, torch.float32)
-    write_ply(tmp_path / "avatar.ply", gaussians)
-    assert np.allclose(trimesh.load(tmp_path / "avatar.ply").vertices, gaussians.means)
-
-
 def test_the_ends_of_the_ranges_stay_finite(tmp_path):
     gaussians, camera = scene(4, 20, 20, torch.float32)
     edges = Gaussians(
@@ -65,43 +58,3 @@ def test_gaussians_that_cannot_be_drawn_are_left_out(tmp_path):
     gaussians.quaternions[2] = 0
     write_ply(tmp_path / "avatar.ply", gaussians)
     assert torch.equal(read_ply(tmp_path / "avatar.ply").means, gaussians.means[[0, 3]])
-
-
-def test_other_programs_extra_properties_are_ignored(tmp_path):
-    gaussians, _ = scene(3, 8, 8, torch.float32)
-    write_ply(tmp_path / "avatar.ply", gaussians)
-    header, body = (tmp_path / "avatar.ply").read_bytes().split(b"end_header\n", 1)
-    rows = np.frombuffer(body, "<f4").reshape(3, 17)
-    header = header.replace(b"property float opacity\n", b"property float f_rest_0\nproperty float opacity\n")
-    rows = np.insert(rows, 9, 7.0, axis=1)
-    (tmp_path / "other.ply").write_bytes(header + b"end_header\n" + rows.tobytes())
-    for ours, theirs in zip(
-        gaussians.tensors()[2:], read_ply(tmp_path / "other.ply").tensors()[2:], strict=True
-    ):
-        assert torch.allclose(ours, theirs, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda data: data[:-1], "truncated"),
-        (lambda data: b"", "not a binary"),
-        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "not a binary"),
-        (lambda data: data.replace(b"float opacity", b"float other"), "lacks opacity"),
-        (lambda data: data.replace(b"float opacity", b"double opacity"), "not float"),
-        (lambda data: data.replace(b"vertex", b"face"), "vertices and nothing else"),
-        (lambda data: data.replace(b"element vertex 2", b"element vertex"), "vertices and nothing else"),
-    ],
-)
-def test_a_spoilt_file_is_one_clear_line(tmp_path, spoil, message):
-    path = tmp_path / "avatar.ply"
-    write_ply(path, scene(2, 8, 8, torch.float32)[0])
-    path.write_bytes(spoil(path.read_bytes()))
-    with pytest.raises(UserError, match=message) as error:
-        read_ply(path)
-    assert str(path) in str(error.value)
-
-
-def test_a_missing_file_is_one_clear_line(tmp_path):
-    with pytest.raises(UserError, match=r"none\.ply"):
-        read_ply(tmp_path / "none.ply")

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from pipeline.body import read_poses
 from pipeline.clip.keypoints import read_keypoints
-from pipeline.clip.records import read_cameras, read_json
+from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
 from pipeline.untrusted import (
     check_picture,
@@ -267,7 +267,9 @@ def test_links_may_not_lead_out_of_their_folder(tmp_path):
 BAD_JSON = (
     '{"a": NaN}',
     '{"a": Infinity}',
+    "[-Infinity]",
     "[1e999]",
+    "",
     "[" * 100_000,
     '{"a": 1',
     "\xff",
@@ -278,9 +280,13 @@ BAD_JSON = (
 @pytest.mark.parametrize("text", BAD_JSON, ids=range(len(BAD_JSON)))
 def test_json_that_is_none_or_not_finite_names_itself(tmp_path, text):
     (tmp_path / "t.json").write_bytes(text.encode("latin1"))
-    for read in (parse_json, read_json):
-        with pytest.raises(UserError, match=r"t\.json is not readable JSON"):
-            read(tmp_path / "t.json", REMEDY)
+    with pytest.raises(UserError, match=r"t\.json is not readable JSON"):
+        parse_json(tmp_path / "t.json", REMEDY)
+
+
+def test_missing_json_is_named(tmp_path):
+    with pytest.raises(UserError, match=rf"t\.json is missing: {REMEDY}"):
+        parse_json(tmp_path / "t.json", REMEDY)
 
 
 def test_json_with_a_million_keys_is_refused(tmp_path):

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.visibility import (
+from pipeline.avatar.otsu_threshold import (
     LARGEST_LOSS,
     evidence_threshold,
     fixed_threshold,
     histogram,
-    in_frame,
     otsu_threshold,
     share_below,
 )
+from pipeline.avatar.visibility import in_frame
 from pipeline.clip.camera import facing_camera
 
 RNG = np.random.default_rng(0)

@@ -103,8 +103,10 @@ class TPoser:
 
     def joints(self, vertices: np.ndarray) -> np.ndarray:
         """The 55 joints of a person in A pose: [M, 3] -> [55, 3]."""
-        bones = bones_of_joints(self.rig)
-        return np.stack([self.rig.end(vertices, _PLACED.get(name, bones[name][0])) for name in JOINTS])
+        bones = bones_of_joints(self.skinning_tables)
+        return np.stack(
+            [self.skinning_tables.end(vertices, _PLACED.get(name, bones[name][0])) for name in JOINTS]
+        )
 
     def __call__(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """T pose of a person's base mesh.
@@ -118,7 +120,7 @@ class TPoser:
             _straighten_arm(rotations, joints, side, sign)
             self._straighten_fingers(rotations, joints, vertices, side, sign)
             _straighten_leg(rotations, joints, side, sign)
-        twist = [self.rig.end(vertices, f"lowerarm02.{letter}") for letter in SIDES.values()]
+        twist = [self.skinning_tables.end(vertices, f"lowerarm02.{letter}") for letter in SIDES.values()]
         rest = np.concatenate([joints, twist])
         posed = rest.copy()
         for j, parent in enumerate(_TWIST_PARENTS):
@@ -135,7 +137,7 @@ class TPoser:
         palm = rotations[JOINT[f"{side}_wrist"]]
         for finger, number in FINGERS.items():
             first = JOINT[f"{side}_{finger}1"]
-            tip = self.rig.end(vertices, f"finger{number}-3.{SIDES[side]}", "tail")
+            tip = self.skinning_tables.end(vertices, f"finger{number}-3.{SIDES[side]}", "tail")
             chain = [*joints[first : first + 3], tip]
             along = palm @ (chain[1] - chain[0])
             spread = 0.6 * np.arctan2(along[2], abs(along[0]))

@@ -1,6 +1,6 @@
 """A texture learnt from the clip without a network: gathered, completed, and painted onto the turn."""
 
-from pipeline.texture import FineSurface, Seen, fine_surface, gather, paint
+from pipeline.texture import FineSurface, VertexColors, fine_surface, gather_colors, paint
 from stages.auxiliary.texture.complete import complete
 
-__all__ = ["FineSurface", "Seen", "complete", "fine_surface", "gather", "paint"]
+__all__ = ["FineSurface", "VertexColors", "complete", "fine_surface", "gather_colors", "paint"]

@@ -14,14 +14,14 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import cg, splu
 
-from pipeline.texture import FineSurface, Seen
+from pipeline.texture import FineSurface, VertexColors
 from stages.auxiliary.texture.shade import shading
 
 _TOLERANCE, _ITERATIONS = 1e-3, 300
 _PULL = 1e-7  # towards the mean, so that a part without any known neighbour has an answer
 
 
-def complete(surface: FineSurface, seen: Seen, light: bool = True) -> np.ndarray:
+def complete(surface: FineSurface, seen: VertexColors, light: bool = True) -> np.ndarray:
     """A colour for every vertex: [N, 3] float32 in 0 to 255.
 
     With ``light`` it is colours without their shading that spread, and each vertex is shaded as its

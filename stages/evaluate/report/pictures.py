@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pipeline.clip.boxes import Box, person_box
 from pipeline.clip.composite import to_bytes
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import spread_end_to_end
 from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.pictures import caption, resized, side_by_side
 from pipeline.splat import Gaussians, Rendering, render

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.clip.curves import Line
+from pipeline.clip.curves import CurvePoints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,7 @@ _INK = "#808080"  # legible on white and on near-black
 _COLORS = ("#3b82c4", "#d07f2c", "#5a9e6f")
 
 
-def plot_training(lines: Mapping[str, Line]) -> list[str]:
+def plot_training(lines: Mapping[str, CurvePoints]) -> list[str]:
     """Held-out PSNR and the loss terms against iterations, an SVG element each; none without lines.
 
     The same lines give the same text. Every loss term but L1 and SSIM is part of the regularisers.
@@ -30,7 +30,7 @@ def plot_training(lines: Mapping[str, Line]) -> list[str]:
     return [_plot(title, group) for title, group in (("PSNR, dB", held_out), ("loss", losses)) if group]
 
 
-def plot_registration(lines: Mapping[str, Line], seconds: Mapping[int, float]) -> list[str]:
+def plot_registration(lines: Mapping[str, CurvePoints], seconds: Mapping[int, float]) -> list[str]:
     """The registration's reprojection error against seconds, an SVG; none without both.
 
     Args:
@@ -41,7 +41,7 @@ def plot_registration(lines: Mapping[str, Line], seconds: Mapping[int, float]) -
     return [_plot("reprojection error, px", {"all trusted points": pixels}, "seconds")] if pixels else []
 
 
-def _loss_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
+def _loss_lines(lines: Mapping[str, CurvePoints]) -> dict[str, CurvePoints]:
     """L1, SSIM, and everything else of the objective added up."""
     found = {label: lines[name] for name, label in _IMAGE_TERMS.items() if lines.get(name)}
     rest: dict[int, float] = {}

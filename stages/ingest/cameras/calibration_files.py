@@ -8,8 +8,9 @@ import numpy as np
 import pycolmap
 import torch
 
-from pipeline.clip.records import read_cameras, read_json
+from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
+from pipeline.untrusted import parse_json
 from stages.ingest.cameras.calibration import (
     CalibratedCamera,
     Calibration,
@@ -125,7 +126,7 @@ def _read_folder(path: Path, clip: Clip) -> Calibration:
 
 
 def _read_json_view(file: Path, clip: Clip) -> CalibratedCamera:
-    value = read_json(file, "write it again with R [3, 3], t [3], focal [2] and princpt [2]")
+    value = parse_json(file, "write it again with R [3, 3], t [3], focal [2] and princpt [2]")
     parts = {}
     for key, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("princpt", (2,))):
         try:

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from pipeline.clip.frames import read_mask, write_mask
-from pipeline.clip.spread import spread_end_to_end
+from pipeline.clip.frames import read_mask, spread_end_to_end, write_mask
 from stages.ingest.cameras.background_motion import background_mask
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.calibration_files import model_views

@@ -1,7 +1,9 @@
-"""Names that a file gives, which must stay in their folder, and how much of a file is read."""
+"""Bounds on files of others: names stay in their folder; bytes, archives and pictures fit into memory."""
 
 from __future__ import annotations
 
+import io
+import warnings
 import zipfile
 from pathlib import Path, PurePosixPath
 
@@ -9,6 +11,7 @@ from pipeline.errors import UserError
 
 GIGABYTE = 1 << 30
 _SHOWN = 60  # characters of a name in a message
+MOST_PIXELS = 100_000_000  # 300 MB of RGB; 8K footage has 33 million
 
 
 def inside(folder: Path, name: str, origin: Path) -> Path:
@@ -64,3 +67,30 @@ def check_unpacked(archive: zipfile.ZipFile, most_members: int, most_bytes: int)
     members = archive.infolist()
     if len(members) > most_members or sum(one.file_size for one in members) > most_bytes:
         raise ValueError(f"it unpacks to more than {most_members} files or {most_bytes >> 20} MB")
+
+
+def check_picture(path: Path, remedy: str, content: bytes | None = None, most: int = MOST_PIXELS) -> None:
+    """Refuse a picture that would not fit into memory.
+
+    Args:
+        path: the file.
+        remedy: what the user can do; it ends the error's line.
+        content: the file's bytes, where they are known already.
+        most: pixels.
+
+    Raises:
+        UserError: no picture of a known kind, or more pixels than allowed.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content) if content is not None else path) as picture:
+                width, height = picture.size
+    except Image.DecompressionBombError:
+        raise UserError(f"{path} claims more pixels than {most:,}: {remedy}") from None
+    except Exception:  # a damaged header raises nearly anything
+        raise UserError(f"{path} is not a readable picture: {remedy}") from None
+    if width * height > most or min(width, height) < 1:
+        raise UserError(f"{path} claims {width}x{height} pixels, more than {most:,}: {remedy}")
