@@ -87,7 +87,7 @@ class Avatar(nn.Module):
         pose_heads_active: whether the pose heads take part.
         residuals_active: whether the residual colour heads take part.
         base_color: [N, 3] logits on the finest level; what the colour heads add to.
-        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``skin.py``.
+        skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_skinning.py``.
     """
 
     base_color: Tensor

@@ -31,7 +31,7 @@ class BakedHead:
         products: [N, C], ``W_f f_i + b``, in the precision that the head runs in.
         condition: [C, P] float32, what the shared vector is multiplied with.
         own: [E, C] float32, what a point's own further inputs are multiplied with.
-        layers: the others, arranged (see ``fused.py``).
+        layers: the others, arranged (see ``fused_head.py``).
     """
 
     products: Tensor  # [N, C]

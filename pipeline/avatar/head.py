@@ -16,7 +16,7 @@ from pipeline.device import autocast, kernels_serve
 class GroupNormReLU(nn.Module):
     """``relu(torch.nn.GroupNorm(x))`` for [N, C] inputs, by ``layer_norm`` on a view.
 
-    On a CPU ``fused.py`` computes it together with the layers around it.
+    On a CPU ``fused_head.py`` computes it together with the layers around it.
     """
 
     def __init__(self, groups: int, channels: int):
