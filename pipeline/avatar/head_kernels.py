@@ -1,4 +1,4 @@
-"""The kernels of ``fused_head.py``: the norm between a head's layers, for centred rows with interleaved groups.
+"""The kernels of ``fused_head.py``: the norm between a head's layers, of centred rows, groups interleaved.
 
 Numba does not know bfloat16: it is read as the upper half of a float32, from memory seen as uint16.
 """

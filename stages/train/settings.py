@@ -56,7 +56,7 @@ class TrainSettings:
     held_out_every: Count = setting(250, "iterations between points of the held-out curve")
     held_out_frames: CountOrNone = setting(3, "frames of each such point")
     checkpoint_every: Count = setting(250, "iterations between checkpoints")
-    # Bytes then do not depend on the number of cores; two threads are 1.5 times as fast (docs/log/2026-11.md).
+    # One: bytes do not depend on the number of cores. Two are 1.5 times as fast (docs/log/2026-11.md).
     threads: Threads = setting(1, "of the CPU, 0 for all")
     # Equal runs give equal bytes on a CPU only, and the key of an artifact holds this word, not what it came
     # to mean (pipeline/device.py); run.json does.
