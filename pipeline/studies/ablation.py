@@ -121,7 +121,8 @@ def run_all(
     subjects: Sequence[str], request: Request, log: Path
 ) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
     """Every variant of every subject, a subject after the other; and the bases that could be read."""
-    bases, results = {}, {}
+    bases: dict[str, Base] = {}
+    results: dict[tuple[str, str], Result] = {}
     progress = Progress(len(subjects) * (len(VARIANTS) + 1), "ablate")
     try:
         for subject in subjects:
@@ -208,7 +209,7 @@ def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
     return [
         table_of(about, ablation, sizes)
         for about in described
-        if ablation.scores[COLUMNS.get(about.get("kind"), list(IMAGE))].notna().any(axis=None)
+        if ablation.scores[COLUMNS.get(about.get("kind", ""), list(IMAGE))].notna().any(axis=None)
     ]
 
 
@@ -220,7 +221,7 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
         ablation: its results.
         sizes: a sentence for the caption.
     """
-    keys = COLUMNS.get(about.get("kind"), list(IMAGE))
+    keys = COLUMNS.get(about.get("kind", ""), list(IMAGE))
     wanted = [row["variant"] for row in about["rows"]]
     present = ablation.scores["psnr"].unstack()[wanted].notna().all(axis=1)
     counted = [subject for subject in ablation.subjects if present[subject]] or ablation.subjects
@@ -245,8 +246,8 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
             values = dict(zip(keys, published(row["values"]), strict=True))
             rows[row["label"]] = {**values, NOTE: "published, on another machine"}
     poses = ", poses refined on them" if ablation.refined else ""
-    caption = CAPTIONS.get(about.get("kind"), f"Means over held-out frames{poses}.")
-    frame, ranked = pd.DataFrame.from_dict(rows, orient="index"), about.get("kind") != "chance"
+    caption = CAPTIONS.get(about.get("kind", ""), f"Means over held-out frames{poses}.")
+    frame, ranked = pd.DataFrame.from_dict(rows, orient="index"), about.get("kind", "") != "chance"
     return Table(about["name"], about["title"], f"{caption} {sizes}", frame, ranked=ranked)
 
 

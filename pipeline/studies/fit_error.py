@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pipeline.body import joint_index, load_body, pose_body, read_identity, read_poses
+from pipeline.body import joint_index, pose_body
 from pipeline.clip.curves import read_curve
+from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table, vectors
 from pipeline.studies.variants import Base, Result, run_record
@@ -54,9 +55,9 @@ def truth_error(ingest: Path, fit: Path, body_file: Path) -> float:
     if not (ingest / "truth_points.parquet").is_file():
         return math.nan
     truth = read_table(ingest / "truth_points.parquet", TRUTH, "run the ingest stage again")
-    body, poses = load_body(body_file), read_poses(fit / "poses.parquet")
-    identity = read_identity(fit / "identity.safetensors", body)
-    _, joints = pose_body(body, identity, poses.rotation, poses.expression, poses.transl)
+    clip = read_fitted_clip(ingest, fit, body_file)
+    poses = clip.poses
+    _, joints = pose_body(clip.body, clip.identity, poses.rotation, poses.expression, poses.transl)
     rows = pd.Index(truth["frame"]).get_indexer(list(poses.frames))
     if (rows < 0).any():
         raise UserError(f"{fit / 'poses.parquet'} has frames without truth: run the fit stage again")

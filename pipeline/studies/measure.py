@@ -20,11 +20,10 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
-from pipeline.body import load_body, read_poses
+from pipeline.body import load_body
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame, over
-from pipeline.clip.frames import read_frame, read_mask
-from pipeline.clip.records import read_cameras, read_footage, read_split
+from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.config.assets import require
 from pipeline.files.json_files import json_text
 from pipeline.metrics import Lpips
@@ -41,6 +40,7 @@ SIDE = 512  # pixels of the picture that speed is measured at
 REPEATS, POSES = 15, 4  # frames that are timed, and poses that they take in turn
 
 Numbers = dict[str, float]
+Posed = Callable[[int], Gaussians]  # frame -> an avatar's Gaussians in that frame's pose
 
 
 class MeasurementCache:
@@ -82,13 +82,9 @@ class AvatarMeter:
     def __init__(self, job: Job, ingest: Path) -> None:
         background = getattr(job.settings["evaluate"], "background", "black")
         self.background = background if background in ("black", "white") else "black"
-        self.ingest, self.body_file = ingest, job.workspace.body_file
+        self.ingest, self.body = ingest, load_body(job.workspace.body_file)
         self.lpips = Lpips(require(job.workspace, "lpips"), "alex")
         self.cache = MeasurementCache(job.workspace.data / "studies" / "measured" / job.subject.name)
-        self.cameras = read_cameras(ingest / "cameras.parquet")
-        self.split = read_split(ingest / "split.json")
-        seconds = read_footage(ingest / "footage.json").seconds
-        self.seconds = dict(zip(sorted(self.cameras), seconds, strict=False))
 
     def quality(self, result: Result) -> Numbers:
         """PSNR, PSNR inside the mask, SSIM and LPIPS, means over the clip's held-out frames.
@@ -99,16 +95,15 @@ class AvatarMeter:
         name = f"quality_{train}_{fit}_{self.ingest.name}_{self.background}"
         return self.cache.get(name, lambda: self._quality(result))
 
+    @torch.no_grad()
     def _quality(self, result: Result) -> Numbers:
-        posed = self._posed(result)
-        rows = [self._frame_quality(posed(frame), frame) for frame in self.split.test]
+        clip, posed = self._posed(result)
+        rows = [self._frame_quality(posed(frame), clip, frame) for frame in clip.split.test]
         return pd.DataFrame(rows).mean().to_dict()
 
-    @torch.no_grad()
-    def _frame_quality(self, gaussians: Gaussians, frame: int) -> Numbers:
-        rendering = render(gaussians, self.cameras[frame])
-        mask = read_mask(self.ingest / "masks", frame)
-        person = partial(composite_frame, read_frame(self.ingest / "frames", frame), mask)
+    def _frame_quality(self, gaussians: Gaussians, clip: FittedClip, frame: int) -> Numbers:
+        rendering, mask = render(gaussians, clip.cameras[frame]), clip.mask(frame)
+        person = partial(composite_frame, clip.frame(frame), mask)
 
         def picture(background: str) -> torch.Tensor:
             return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)
@@ -122,16 +117,11 @@ class AvatarMeter:
         }
 
     @torch.no_grad()
-    def _posed(self, result: Result) -> Callable[[int], Gaussians]:
-        """A function: frame -> the baked avatar's Gaussians in that frame's fitted pose."""
-        baked = bake(load_avatar(result.folders["train"] / "avatar.safetensors", load_body(self.body_file)))
-        poses = read_poses(result.folders["fit"] / "poses.parquet")
-
-        @torch.no_grad()
-        def posed(frame: int) -> Gaussians:
-            return baked.gaussians(poses.pose(frame), self.seconds.get(frame))
-
-        return posed
+    def _posed(self, result: Result) -> tuple[FittedClip, Posed]:
+        """The clip with the poses of a result's own fit, and the baked avatar in them."""
+        clip = read_fitted_clip(self.ingest, result.folders["fit"], self.body)
+        baked = bake(load_avatar(result.folders["train"] / "avatar.safetensors", self.body))
+        return clip, lambda frame: baked.gaussians(clip.pose(frame), clip.seconds.get(frame))
 
     def speeds(self, results: Sequence[Result]) -> dict[str, Numbers]:
         """Size and time of a frame of each finished avatar: name of the train version -> numbers.
@@ -153,18 +143,17 @@ class AvatarMeter:
         return {name: numbers for name, numbers in known.items() if numbers is not None}
 
     @torch.no_grad()
-    def _timed(self, avatars: Mapping[str, Callable[[int], Gaussians]]) -> dict[str, Numbers]:
-        held_out = self.split.test or self.split.train
-        frames = held_out[:: max(1, len(held_out) // POSES)][:POSES]
-        camera = square(self.cameras[frames[0]])
-        found = {}
-        for name, posed in avatars.items():  # the first frame compiles and warms up
+    def _timed(self, avatars: Mapping[str, tuple[FittedClip, Posed]]) -> dict[str, Numbers]:
+        clip, _ = next(iter(avatars.values()))
+        frames = clip.spread(POSES, "test") or clip.spread(POSES)
+        camera, found = square(clip.cameras[frames[0]]), {}
+        for name, (_, posed) in avatars.items():  # the first frame compiles and warms up
             gaussians = posed(frames[0])
             render(gaussians, camera)
             floats = sum(tensor.numel() for tensor in gaussians.tensors())
             found[name] = {"gaussians": float(len(gaussians.means)), "asset_mib": 4 * floats / 2**20}
         for repeat in range(REPEATS):
-            for name, posed in avatars.items():
+            for name, (_, posed) in avatars.items():
                 start = time.process_time()
                 gaussians = posed(frames[(repeat + 1) % len(frames)])
                 middle = time.process_time()

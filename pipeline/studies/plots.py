@@ -107,14 +107,9 @@ def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], acros
     shown = {name: line for name, line in lines.items() if line}
     for place, (name, line) in enumerate(shown.items()):
         first = place < len(LINES)
-        style = (
-            {"color": LINES[place], "linewidth": 1.7, "markersize": 3}
-            if first
-            else {"color": GREY, "alpha": 0.55}
-        )
-        axes.plot(
-            *zip(*line, strict=True), marker=".", label=name if first else None, zorder=99 - place, **style
-        )
+        (drawn,) = axes.plot(*zip(*line, strict=True), marker=".", zorder=99 - place)
+        drawn.set(color=LINES[place] if first else GREY, linewidth=1.7 if first else 0.9)
+        drawn.set_label(name if first else "_")  # a name that the legend leaves out
     if shown:
         figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7.5)
     _save(figure, path)

@@ -125,7 +125,7 @@ class Search:
 
     def alone(self) -> pd.DataFrame:
         """The base and the levels that were tried alone, but for another seed; see ``combinations``."""
-        rows = [(None, 0.0, 1.0)]
+        rows: list[tuple[Level | None, float, float]] = [(None, 0.0, 1.0)]
         for level in (design[0] for design in self.results if len(design) == 1):
             if level.parameter != CHANCE:
                 rows.append((level, self.psnr[(level,)] - self.psnr[()], self.cost_ratio(level)))

@@ -168,8 +168,9 @@ def combinations(alone: pd.DataFrame, noise: float) -> list[Design]:
         noise: the gain in dB that chance has; NaN where it is not known.
     """
     alone = alone[alone["gain"].notna() & alone["ratio"].notna()]
+    least = noise if math.isfinite(noise) else 0.0
     unbeaten = alone.index.isin(frontier(alone["ratio"], alone["gain"]))
-    kept = alone[((alone["gain"] > max(noise, 0.0)) | unbeaten) & alone["level"].notna()]
+    kept = alone[((alone["gain"] > least) | unbeaten) & alone["level"].notna()]
     worth = [gain_for_time(row.gain, row.ratio) for row in kept.itertuples()]
     best = kept["level"].iloc[pd.Series(worth, dtype=float).argsort(kind="stable")[::-1]][:MOST_COMBINED]
     return [

@@ -44,6 +44,8 @@ from pipeline.studies.tables import MAIN, NOTE, Table
 from pipeline.studies.variants import Base, Result, Variant, base_of, run_record, study_folder
 
 DEFAULT_BUDGET = "20m"
+Run = tuple[Result, Design | None, str]
+"""A result, its design (None for a preset), and the preset that it is (empty if none)."""
 COLUMNS = (
     "gaussians", "psnr", "psnr_interior", "ssim", "lpips_alex", "train_s", "times", "gain", "whole_s",
     "animation_ms", "rendering_ms", "short",
@@ -118,7 +120,9 @@ def tradeoff(subject: str, request: Request) -> Path:
     presets, expected = run_presets(search, levels)
     search.make_affordable(combinations(search.alone(), search.noise))
 
-    runs = [(result, design, "" if design else base.preset) for design, result in search.results.items()]
+    runs: list[Run] = [
+        (result, design, "" if design else base.preset) for design, result in search.results.items()
+    ]
     runs += [(result, None, preset) for preset, result in presets.items()]
     done = [result for result, _, _ in runs if not result.failure]
     print(f"timing {len(done)} avatars in motion", flush=True)
@@ -131,7 +135,8 @@ def tradeoff(subject: str, request: Request) -> Path:
 
 def run_fits(search: Search) -> pd.DataFrame:
     """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
-    own, rows = search.base.settings["fit"].iterations, {}
+    own = max(1, search.base.settings["fit"].iterations)
+    rows: dict[int, Mapping[str, float | str]] = {}
     for steps in fit_steps(own):
         overrides = {"fit.iterations": str(steps)}
         seconds = search.results[()].seconds["fit"] * steps / own
@@ -182,9 +187,7 @@ def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
     return cost
 
 
-def point_table(
-    runs: Sequence[tuple[Result, Design | None, str]], measured: Sequence[Mapping[str, float]]
-) -> pd.DataFrame:
+def point_table(runs: Sequence[Run], measured: Sequence[Mapping[str, float]]) -> pd.DataFrame:
     """The points, as ``Tradeoff`` describes them.
 
     Args:
@@ -357,7 +360,7 @@ def headline(study: Tradeoff) -> str:
     levels, base = study.choices[single & study.choices["psnr"].notna()], study.points.loc[1]
     if levels.empty:
         return "The budget reached no setting but the study's own: give it more time."
-    noise = max(study.noise, 0.0)
+    noise = study.noise if math.isfinite(study.noise) else 0.0
     gaining = levels[levels["gain"] > noise]
     if gaining.empty:
         chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"

@@ -163,7 +163,7 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
-    if hasattr(train, "held_out_every"):
+    if train is not None and hasattr(train, "held_out_every"):
         lean["train.held_out_every"] = str(min(train.held_out_every, max(1, train.iterations // 10)))
     changed = any(not name.startswith("evaluate.") for name in own)
     full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
@@ -192,7 +192,7 @@ def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Resu
         folders: stage -> its version.
     """
     records = {stage: run_record(folder) for stage, folder in folders.items()}
-    summary = {"means": {}, "gaussians": 0}
+    summary: dict[str, Any] = {"means": {}, "gaussians": 0}
     if "evaluate" in folders:
         summary = json.loads((folders["evaluate"] / SUMMARY).read_text(encoding="utf-8"))
     return Result(

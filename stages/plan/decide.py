@@ -22,7 +22,7 @@ from stages.plan.measure import (
 )
 from stages.plan.settings import PlanSettings
 
-# As in stages/ingest/cameras/motion.py, which is where it decides; a test compares them.
+# As in stages/ingest/cameras/background_motion.py, which is where it decides; a test compares them.
 BACKGROUND_MOTION = 0.03
 
 # Share of a part's vertices. Mannequins: what a framing shows reaches 0.4 and more, what it does not 0.

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -36,12 +35,9 @@ from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
-from stages.train.hooks import Hook
+from stages.train.loop import Hook, Trainer
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-
-if TYPE_CHECKING:
-    from stages.train.loop import Trainer
 
 SCHEMA = pa.schema(
     [

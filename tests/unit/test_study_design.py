@@ -172,10 +172,14 @@ def test_a_combination_of_two_good_levels_is_found_and_the_best_for_its_time_com
     assert search.noise == pytest.approx(0.1)
 
 
-def test_levels_that_gain_less_than_chance_and_save_nothing_are_not_combined():
-    search = World((1.2, 1.3, 1, 1.5, 2), (0.05, -1, 0.1, 0.08, 1)).search(1e9)
-    combined = {one for design in search.results if len(design) > 1 for one in design}
-    assert HALF not in combined
+def test_levels_that_gain_less_than_chance_and_are_beaten_are_not_combined():
+    search = World((1.2, 1.3, 1, 1.5, 2), (0.09, -1, 0.1, 0.08, 1)).search(1e9)
+
+    def combined(noise):
+        return {one for design in combinations(search.alone(), noise) for one in design}
+
+    assert search.noise == pytest.approx(0.1) and combined(search.noise) == {WITHOUT, DOUBLE}
+    assert combined(math.nan) == {WITHOUT, LARGE, DOUBLE}  # no other seed was reached
     assert combinations(search.alone().iloc[:1], math.nan) == []
 
 

@@ -1,5 +1,6 @@
 """A study's tables, plots and page."""
 
+import dataclasses
 import html.parser
 import json
 import math
@@ -260,6 +261,13 @@ def test_one_sentence_says_what_pays(tmp_path):
     assert "0.1 dB" in idle and "5,000 Gaussians" in idle  # nothing is cheaper and as good
     cheaper = pays(tradeoff_of(tmp_path, (0.0, -0.05, -0.3, 0.1), (20.0, 8.0, 4.0, 20.0)))
     assert "400 iterations" in cheaper and "0.4 times" in cheaper and "was 5.0" in cheaper
+
+
+def test_a_sentence_is_said_of_whatever_the_budget_reached(tmp_path):
+    study = tradeoff_of(tmp_path, gains=(0.0, -0.5, -0.4, 0.1))
+    for reached in ([1], [1, 2], [1, 2, 3], [1, 4], [1, 5]):
+        told = pays(dataclasses.replace(study, points=study.points.loc[reached]))
+        assert told.endswith(".") and "nan" not in told
 
 
 def test_another_seed_is_no_choice(tmp_path):
