@@ -167,7 +167,7 @@ def round_ticks(low: float, high: float) -> list[float]:
     steps = (1, 2, 5) if len(decades) < 5 else (1,)
     ticks = [step * 10.0**decade for decade in decades for step in steps]
     if high < 5 * low:
-        ticks = MaxNLocator(6).tick_values(low, high).tolist()
+        ticks = list(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high))
     return [tick for tick in ticks if low <= tick <= high]
 
 
