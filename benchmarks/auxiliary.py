@@ -39,8 +39,8 @@ from pipeline.run.job import Job, open_job, run_stage
 from pipeline.splat import render
 from pipeline.store.artifact import Artifact
 from stages.ingest.mannequin.footage import Filming
-from stages.ingest.mannequin.scene import Picture, Scene, film, make_background
-from stages.ingest.mannequin.spec import spec_of
+from stages.ingest.mannequin.scene import FilmedFrame, Scene, film, make_background
+from stages.ingest.mannequin.spec import mannequin_spec
 
 UNSEEN = (135.0, 180.0, 225.0)  # degrees
 MOTION = {"full": "sway+gesture", "upper": "sway+gesture", "head": "nod+speech"}
@@ -150,7 +150,9 @@ def _body(job: Job):
 def _scene(job: Job) -> Scene:
     """The mannequin before the cameras, the same as ingest filmed."""
     body = _body(job)
-    return Filming(spec_of(job.settings["ingest"]), body, load_landmarks(body, job.workspace.body)).scene
+    return Filming(
+        mannequin_spec(job.settings["ingest"]), body, load_landmarks(body, job.workspace.body)
+    ).scene
 
 
 def around(scene: Scene, degrees: float) -> Camera:
@@ -162,7 +164,7 @@ def around(scene: Scene, degrees: float) -> Camera:
     return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
 
 
-def _filmed(scene: Scene, frame: int, camera: Camera) -> Picture:
+def _filmed(scene: Scene, frame: int, camera: Camera) -> FilmedFrame:
     return film(scene, frame, camera, make_background(camera, scene.seed))
 
 

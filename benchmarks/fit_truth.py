@@ -37,8 +37,8 @@ from pipeline.clip.camera import Camera, project
 from pipeline.clip.keypoints import Keypoints
 from pipeline.pose_files import InitialPoses
 from stages.ingest.mannequin import DETECTORS, MannequinSpec
-from stages.ingest.mannequin.detector import detect
 from stages.ingest.mannequin.footage import Filming
+from stages.ingest.mannequin.simulated_detector import simulate_detections
 from stages.ingest.mannequin.truth import SEEN, Truth, seen_vertices
 
 BODY_FOLDER = Path(__file__).parents[1] / "data" / "body"
@@ -148,7 +148,7 @@ def make_clips(spec: MannequinSpec, stage: Stage, detectors: tuple[str, ...]) ->
     clips = []
     for name in detectors:
         seer = dataclasses.replace(spec, detector="heatmap" if name == REGRESSOR else name)
-        keypoints = detect(seer, camera, filming.places, filming.point_states)
+        keypoints = simulate_detections(seer, camera, filming.places, filming.point_states)
         start = regressed(truth, camera, spec.seed) if name == REGRESSOR else None
         clips.append(TrueClip(spec, name, keypoints, cameras, truth, vertices, seen, start))
     return clips

@@ -113,7 +113,8 @@ def load_landmarks(body: BodyModel, folder: Path) -> Landmarks:
         UserError: there are none for this body's topology, or the file is damaged.
     """
     path = landmarks_file(body, folder)
-    remedy = f"make it with: python tools/build_landmarks.py BODY.npz --out {path.parent}"
+    remedy = f"make it with: python tools/build_landmarks.py BODY.npz --face WHEEL --out {path.parent}"
+    remedy += " (docs/bring.md says which wheel)"
     if not path.is_file():
         raise UserError(f"{path} is missing, so it is not known where keypoints lie on this body: {remedy}")
     try:

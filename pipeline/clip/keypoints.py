@@ -22,6 +22,7 @@ all zero, and a score of 0 means that nothing is known of the point. Scores lie 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,16 @@ class Keypoints:
 
     def _array(self, column: str) -> np.ndarray:
         return getattr(self, "whole_body" if column == "keypoints" else column)
+
+    def select(self, rows: np.ndarray) -> Keypoints:
+        """The keypoints of some rows, [N] int."""
+        return Keypoints(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Keypoints]) -> Keypoints:
+        """The keypoints of clips whose frame numbers follow one another."""
+        names = [field.name for field in dataclasses.fields(Keypoints)]
+        return Keypoints(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 
     def index(self, frame: int) -> int:
         """The row of a frame number; KeyError if the frame was not kept."""

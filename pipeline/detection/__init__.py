@@ -1,1 +1,1 @@
-"""What is detected of a person in a picture: MediaPipe's landmarks and segmentations."""
+"""MediaPipe's landmarks and segmentations of a person, and the 133 whole-body points made of them."""

@@ -25,7 +25,7 @@ BLANK = np.zeros((64, 64, 3), np.uint8)
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What MediaPipe saw in one picture; every coordinate as a fraction of the picture's size.
+    """MediaPipe's landmarks and masks of one picture; coordinates as fractions of the picture's size.
 
     z has the scale of x, smaller nearer to the camera. What was not found is None.
 
@@ -58,9 +58,9 @@ class Estimator:
             native_log: where the models' native code may write its remarks.
             still: look at every picture as if it were the first.
         """
-        solutions = load(asset)
+        solutions = load_mediapipe(asset)
         self._native_log = native_log
-        with aside(native_log):
+        with native_errors_to(native_log):
             self._holistic = solutions.holistic.Holistic(
                 static_image_mode=still,
                 model_complexity=1,
@@ -73,7 +73,7 @@ class Estimator:
 
     def estimate(self, image: np.ndarray) -> Estimate | None:
         """The person in ``image`` [H, W, 3] uint8 RGB, or None where there is none."""
-        with aside(self._native_log):
+        with native_errors_to(self._native_log):
             found = self._holistic.process(image)
         if found.pose_landmarks is None or found.segmentation_mask is None:
             return None
@@ -96,13 +96,13 @@ class Estimator:
             margin = round(BOX_MARGIN * (places[-1] + 1 - places[0]))
             box.append(slice(max(0, places[0] - margin), min(length, places[-1] + 1 + margin)))
         part = np.ascontiguousarray(image[box[0], box[1]])
-        with aside(self._native_log):
+        with native_errors_to(self._native_log):
             whole[box[0], box[1]] = np.clip(self._selfie.process(part).segmentation_mask, 0, 1)
         return whole
 
 
 def estimator_scale(width: int, height: int, short_side: int, long_side: int) -> float:
-    """By how much a picture is resized for the estimator; small ones grow, to three times at most."""
+    """The factor by which a picture is resized for the estimator: at most 3, below 1 for large ones."""
     if max(width, height) > long_side:
         return long_side / max(width, height)
     most = min(3, max(1, long_side // max(width, height)))
@@ -117,7 +117,7 @@ def resize(image: np.ndarray, scale: float) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
 
 
-def load(asset: Path) -> Any:
+def load_mediapipe(asset: Path) -> Any:
     """``mediapipe.solutions`` from the asset's folder."""
     os.environ.setdefault("GLOG_minloglevel", "3")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -133,8 +133,8 @@ def load(asset: Path) -> Any:
 
 
 @contextlib.contextmanager
-def aside(log: Path) -> Iterator[None]:
-    """What native code prints to the terminal's error stream goes to ``log`` instead."""
+def native_errors_to(log: Path) -> Iterator[None]:
+    """Send what native code prints to the terminal's error stream to the file ``log`` instead."""
     sys.stderr.flush()
     kept, target = os.dup(2), os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     try:

@@ -39,13 +39,13 @@ FACE_MESH_OF_BODY = (
     FACE_MESH_RIGHT_IRIS,
     454,
     234,
-)  # to the ears' fronts
+)  # ears: their fronts
 SMALL_HAND, CLEAR_HAND = 5.0, 14.0  # palm length in the estimator's pixels
 SMALL_FACE, CLEAR_FACE = 6.0, 20.0  # distance of the irises
 
 
 @dataclasses.dataclass(frozen=True)
-class Landmarks:
+class PixelLandmarks:
     """An estimate without its masks, in pixels of the stored frame; zeros where nothing was found.
 
     Attributes:
@@ -61,7 +61,7 @@ class Landmarks:
     hands: np.ndarray
 
 
-def to_pixels(estimate: Estimate, width: int, height: int) -> Landmarks:
+def to_pixels(estimate: Estimate, width: int, height: int) -> PixelLandmarks:
     """Fractions of the picture as pixels of a frame of ``width`` x ``height``."""
     scale = np.array([width, height, width], np.float32)
 
@@ -73,12 +73,12 @@ def to_pixels(estimate: Estimate, width: int, height: int) -> Landmarks:
         return array
 
     hands = np.stack([scaled(hand, 21) for hand in estimate.hands])
-    return Landmarks(scaled(estimate.pose, 33), estimate.world.copy(), scaled(estimate.face, 478), hands)
+    return PixelLandmarks(scaled(estimate.pose, 33), estimate.world.copy(), scaled(estimate.face, 478), hands)
 
 
 def to_keypoints(
     frames: np.ndarray,  # [T]
-    landmarks: Sequence[Landmarks],
+    landmarks: Sequence[PixelLandmarks],
     width: int,
     height: int,
     magnification: float,
@@ -102,8 +102,8 @@ def to_keypoints(
     hand_score = np.stack(
         [score_hands(hands[:, side], pose[:, POSE_WRISTS[side]], magnification) for side in (0, 1)], axis=1
     )
-    face[..., 3] = face_score[:, None] * inside(face, size)
-    hands[..., 3] = hand_score[..., None] * inside(hands, size)
+    face[..., 3] = face_score[:, None] * inside_picture(face, size)
+    hands[..., 3] = hand_score[..., None] * inside_picture(hands, size)
     keypoints.pose_image[:] = pose
     keypoints.pose_world[:] = np.stack([one.world for one in landmarks])
     keypoints.face_mesh[:] = np.where(face[..., 3:] > 0, face, 0)
@@ -124,7 +124,7 @@ def _fill_whole_body(
     def planar(points: np.ndarray, score: np.ndarray) -> np.ndarray:
         return np.concatenate([points[..., :2], score[..., None]], axis=-1)
 
-    pose_score = np.clip(pose[..., 3], 0, 1) * inside(pose, size)
+    pose_score = np.clip(pose[..., 3], 0, 1) * inside_picture(pose, size)
     whole[:, BODY] = planar(pose, pose_score)[:, list(POSE_TO_BODY)]
     whole[:, FEET] = planar(pose, pose_score)[:, list(POSE_TO_FEET)]
     whole[:, [FEET.start + 1, FEET.start + 4], 2] *= SMALL_TOE_SCORE
@@ -138,13 +138,13 @@ def _fill_whole_body(
     whole[whole[..., 2] <= 0] = 0
 
 
-def inside(points: np.ndarray, size: np.ndarray) -> np.ndarray:
+def inside_picture(points: np.ndarray, size: np.ndarray) -> np.ndarray:
     """1 where a point [..., 2+] lies in the picture, else 0, [...] float32."""
     return np.asarray(((points[..., :2] >= 0) & (points[..., :2] <= size)).all(-1), np.float32)
 
 
 def score_hands(hand: np.ndarray, wrist: np.ndarray, magnification: float) -> np.ndarray:
-    """How far one hand's detections can be trusted, [T] in [0, 1].
+    """The trust in one hand's detections, [T] float32 in [0, 1].
 
     Args:
         hand: [T, 21, 4], pixels, found.
@@ -163,14 +163,19 @@ def score_hands(hand: np.ndarray, wrist: np.ndarray, magnification: float) -> np
     typical = float(np.median(palm[found]))
     ratio = palm / typical
     apart = np.linalg.norm(hand[:, 0, :2] - wrist[:, :2], axis=-1) / typical
-    score = rise(palm * magnification, SMALL_HAND, CLEAR_HAND)
-    score = score * rise(ratio, 0.35, 0.65) * (1 - rise(ratio, 1.6, 2.4)) * (1 - rise(apart, 1.2, 2.5))
-    score = score * (1 - rise(detour(hand[:, [0, 5, 17], :2].mean(1), found) / typical, 0.8, 2.0))
+    score = smoothstep(palm * magnification, SMALL_HAND, CLEAR_HAND)
+    score = (
+        score
+        * smoothstep(ratio, 0.35, 0.65)
+        * (1 - smoothstep(ratio, 1.6, 2.4))
+        * (1 - smoothstep(apart, 1.2, 2.5))
+    )
+    score = score * (1 - smoothstep(detour(hand[:, [0, 5, 17], :2].mean(1), found) / typical, 0.8, 2.0))
     return (score * found).astype(np.float32)
 
 
 def score_faces(face: np.ndarray, pose: np.ndarray, magnification: float) -> np.ndarray:
-    """How far the face mesh can be trusted, [T] in [0, 1]: size, agreement with the pose's nose, jumps.
+    """The trust in the face mesh, [T] float32 in [0, 1], by size, agreement with the pose's nose, and jumps.
 
     Args:
         face: [T, 478, 4], pixels, found.
@@ -184,20 +189,19 @@ def score_faces(face: np.ndarray, pose: np.ndarray, magnification: float) -> np.
     spans = [np.linalg.norm(face[:, a, :2] - face[:, b, :2], axis=-1) for a, b in ((10, 152), (127, 356))]
     length = np.maximum(np.max(spans, axis=0), 1e-3)
     apart = np.linalg.norm(face[:, FACE_MESH_NOSE, :2] - pose[:, 0, :2], axis=-1) / length
-    score = rise(length * magnification, 2 * SMALL_FACE, 2 * CLEAR_FACE) * (1 - rise(apart, 0.5, 1.0))
-    score = score * (1 - rise(detour(face[:, FACE_MESH_NOSE, :2], found) / length, 0.3, 0.8))
+    score = smoothstep(length * magnification, 2 * SMALL_FACE, 2 * CLEAR_FACE) * (
+        1 - smoothstep(apart, 0.5, 1.0)
+    )
+    score = score * (1 - smoothstep(detour(face[:, FACE_MESH_NOSE, :2], found) / length, 0.3, 0.8))
     return (score * found).astype(np.float32)
 
 
 def detour(points: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """How far a point leaves its course: the distance to the median of the five frames about it.
+    """The distance of a point from the median of the five frames about it, [T].
 
     Args:
-        points: [T, 2].
-        found: [T] bool; only these count.
-
-    Returns:
-        [T], the unit of ``points``; 0 where fewer than three frames about it were found.
+        points: [T, 2], any unit, which is the result's.
+        found: [T] bool; only these count, and with fewer than three of them the distance is 0.
     """
     distances = np.zeros(len(points))
     for row in np.flatnonzero(found).tolist():
@@ -207,7 +211,7 @@ def detour(points: np.ndarray, found: np.ndarray) -> np.ndarray:
     return distances
 
 
-def rise(value: np.ndarray, start: float, end: float) -> np.ndarray:
+def smoothstep(value: np.ndarray, start: float, end: float) -> np.ndarray:
     """0 up to ``start``, 1 from ``end`` on, smooth between (3t^2 - 2t^3)."""
     t = np.clip((value - start) / (end - start), 0, 1)
     return t * t * (3 - 2 * t)

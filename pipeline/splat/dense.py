@@ -34,7 +34,7 @@ class Projected:
 
 
 def render_dense(gaussians: Gaussians, camera: Camera) -> Rendering:
-    """Render as ``constants`` says. The camera's intrinsics receive no gradient, its extrinsics do."""
+    """Render as ``image_formation.py`` says. Extrinsics receive a gradient, intrinsics do not."""
     index = usable(gaussians, camera).nonzero()[:, 0]
     depths = to_camera(camera, gaussians.means.detach()[index])[:, 2]
     index = index[torch.argsort(depths.float(), stable=True)]

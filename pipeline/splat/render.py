@@ -15,7 +15,7 @@ def render(gaussians: Gaussians, camera: Camera, backend: str = "auto") -> Rende
 
     Gradients reach every tensor of ``gaussians`` and the camera's rotation and translation (not its
     intrinsics). A Gaussian that cannot be drawn (a number that is not finite, no orientation, behind the
-    camera, ...: see ``constants``) is left out and has a gradient of zero; the others do not notice.
+    camera, ...: see ``image_formation.py``) is left out and has a gradient of zero; the others do not notice.
 
     Args:
         gaussians: in world coordinates. float64 is kept, everything else is computed in float32.

@@ -135,7 +135,7 @@ def tradeoff(subject: str, request: Request) -> Path:
 
 def run_fits(search: Search) -> pd.DataFrame:
     """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
-    own = search.base.settings["fit"].iterations
+    own = max(1, search.base.settings["fit"].iterations)
     rows: dict[int, Mapping[str, float | str]] = {}
     for steps in fit_steps(own):
         overrides = {"fit.iterations": str(steps)}

@@ -1,4 +1,4 @@
-"""What stands still behind the person, learnt from the clip itself.
+"""The background that stands still behind the person, learnt from the clip itself.
 
 Each pixel's mean colour and spread over the frames in which the person is surely elsewhere. Where the
 camera or the scene moves the spread is wide, and the pixel counts as unknown.
@@ -6,7 +6,9 @@ camera or the scene moves the spread is wide, and the pixel counts as unknown.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,46 +21,35 @@ NOISE = 6.0  # grey levels that every pixel may differ by
 PULL, PUSH = 4.0, 1.0  # log-odds that likeness takes away, and unlikeness adds
 
 
+@dataclasses.dataclass(frozen=True)
 class Background:
-    """The background's mean and spread, summed up frame by frame."""
+    """The mean colour [H, W, 3], spread [H, W] in grey levels, and confidence [H, W] in [0, 1]; float32."""
 
-    def __init__(self, height: int, width: int) -> None:
-        """Know nothing yet."""
-        self._count = np.zeros((height, width), np.float32)
-        self._sum = np.zeros((height, width, 3), np.float64)
-        self._squares = np.zeros((height, width), np.float64)
+    mean: np.ndarray
+    spread: np.ndarray
+    confidence: np.ndarray
 
-    def add(self, image: np.ndarray, alpha: np.ndarray) -> None:
-        """Learn from one frame.
 
-        Args:
-            image: [H, W, 3] uint8.
-            alpha: [H, W] in [0, 1], where the person may be.
-        """
+def learn_background(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Background | None:
+    """The background of (image [H, W, 3] uint8, mask [H, W] in [0, 1]) pairs; None where there are none."""
+    count: Any = 0.0  # [H, W] float32 from the first frame on
+    total: Any = 0.0
+    squares: Any = 0.0
+    for image, alpha in pairs:
         reach = max(3, round(MARGIN * max(alpha.shape)))
         weight = (cv2.dilate(alpha, np.ones((reach, reach), np.uint8)) < ABSENT).astype(np.float32)
         colour = image.astype(np.float64) * weight[..., None]
-        self._count += weight
-        self._sum += colour
-        self._squares += np.square(colour).mean(-1)
-
-    def model(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean colour [H, W, 3], spread [H, W] in grey levels, and trust in both, [H, W] in [0, 1]."""
-        count = np.maximum(self._count, 1)
-        mean = self._sum / count[..., None]
-        spread = np.sqrt(np.maximum(self._squares / count - np.square(mean).mean(-1), 0))
-        known = np.clip((self._count - FEWEST) / (ENOUGH - FEWEST), 0, 1)
-        known = known * np.clip((MOVING - spread) / (MOVING - STILL), 0, 1)
-        return mean.astype(np.float32), spread.astype(np.float32), known.astype(np.float32)
-
-
-def learn(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Background | None:
-    """The background of (image, mask) pairs; None where there are none."""
-    background = None
-    for image, alpha in pairs:
-        background = background or Background(*alpha.shape)
-        background.add(image, alpha)
-    return background
+        count = count + weight
+        total = total + colour
+        squares = squares + np.square(colour).mean(-1)
+    if not np.ndim(count):
+        return None
+    seen = np.maximum(count, 1)
+    mean = total / seen[..., None]
+    spread = np.sqrt(np.maximum(squares / seen - np.square(mean).mean(-1), 0))
+    known = np.clip((count - FEWEST) / (ENOUGH - FEWEST), 0, 1)
+    known = known * np.clip((MOVING - spread) / (MOVING - STILL), 0, 1)
+    return Background(mean.astype(np.float32), spread.astype(np.float32), known.astype(np.float32))
 
 
 def log_odds(alpha: np.ndarray) -> np.ndarray:
@@ -67,23 +58,18 @@ def log_odds(alpha: np.ndarray) -> np.ndarray:
     return np.log(safe / (1 - safe))
 
 
-def take_out(
-    alpha: np.ndarray,  # [H, W]
-    image: np.ndarray,  # [H, W, 3]
-    model: tuple[np.ndarray, np.ndarray, np.ndarray],
+def subtract_background(
+    alpha: np.ndarray,  # [H, W] in [0, 1]
+    image: np.ndarray,  # [H, W, 3] uint8
+    background: Background,
 ) -> np.ndarray:
-    """The mask moved by what is known of the background, [H, W] float32 in [0, 1].
+    """The mask with the known background taken out, [H, W] float32 in [0, 1].
 
     A pixel that looks like the background loses, unless the mask is sure of it; one that does not
     gains, where the mask already half believes in it: a shadow is unlike the background as well.
-
-    Args:
-        alpha: [H, W] in [0, 1].
-        image: [H, W, 3] uint8.
-        model: what :meth:`Background.model` returns.
     """
-    mean, spread, known = model
-    distance = cv2.blur(np.sqrt(np.square(image - mean).mean(-1)), (3, 3)) / (NOISE + 2 * spread)
+    known, away = background.confidence, np.sqrt(np.square(image - background.mean).mean(-1))
+    distance = cv2.blur(away, (3, 3)) / (NOISE + 2 * background.spread)
     unlike = np.clip((distance - 1) / 3, 0, 1)
     odds = log_odds(alpha) - known * PULL * np.clip(1 - 2 * unlike, 0, 1)
     odds += known * PUSH * np.clip(2 * unlike - 1, 0, 1) * (alpha > 0.15)

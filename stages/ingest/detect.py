@@ -1,4 +1,4 @@
-"""The passes that look at the footage: who is in it, and what is seen of the chosen person."""
+"""The passes over the footage: the people in it, then landmarks and masks of the chosen one."""
 
 from __future__ import annotations
 
@@ -13,26 +13,29 @@ import numpy as np
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints, empty_keypoints
 from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
-from pipeline.detection.wholebody import Landmarks, inside, to_keypoints, to_pixels
+from pipeline.detection.wholebody import PixelLandmarks, inside_picture, to_keypoints, to_pixels
 from stages.ingest import people
-from stages.ingest.detections import check_frames, read_foreign_mask, read_whole_body
-from stages.ingest.finder import Finder
-from stages.ingest.masks import write_raw
+from stages.ingest.external_detections import (
+    DetectionSources,
+    check_frames,
+    read_given_mask,
+    read_whole_body,
+)
+from stages.ingest.masks import write_segmentations
 from stages.ingest.settings import IngestSettings
-from stages.ingest.sources import Sources
-from stages.ingest.video import Clip, Picture, read_clip
+from stages.ingest.video import Clip, SourceFrame, read_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
 
-LOOKS_A_SECOND = 5  # how often the clip is searched for people
+SEARCHES_A_SECOND = 5  # for people
 NATIVE_LOG = "mediapipe.log"
 BEST_POINTS = 5  # a person is there when this many body points are
 
 
 @dataclasses.dataclass(frozen=True)
-class Detected:
-    """What came of the clip; the frames and their raw masks are on disk by now.
+class DetectedClip:
+    """The kept frames of a clip, whose pictures and raw masks are on disk.
 
     Attributes:
         keypoints: of the kept frames.
@@ -55,29 +58,32 @@ class Detected:
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
-    """One frame's person.
+class FrameDetections:
+    """The person in one frame.
 
     Attributes:
         landmarks: MediaPipe's, or None where it was not asked or found nobody.
-        whole_body: [133, 3] of the other source, pixels of the stored frame, or None.
-        masks: [H, W] float32 in [0, 1], not refined: one that somebody else made, or the pose model's and
-            the selfie segmentation.
+        whole_body: [133, 3] of another program, pixels of the stored frame, or None.
+        masks: [H, W] float32 in [0, 1], not refined: another program's, or the pose model's and the selfie
+            segmentation.
     """
 
-    landmarks: Landmarks | None
+    landmarks: PixelLandmarks | None
     whole_body: np.ndarray | None
     masks: tuple[np.ndarray, ...]
 
 
-class Looker:
-    """Looks at one frame after the other."""
+class FrameDetector:
+    """Detects the chosen person in one frame after the other."""
 
-    def __init__(self, context: Context, clip: Clip, sources: Sources, who: people.Survey) -> None:
-        """Load what the sources call for."""
-        self.settings, self.clip, self.sources, self.who = context.settings, clip, sources, who
+    def __init__(
+        self, context: Context, clip: Clip, sources: DetectionSources, found: people.ClipPeople
+    ) -> None:
+        """Load the estimator if the sources need it."""
+        self.settings, self.clip, self.sources, self.people = context.settings, clip, sources, found
         self.scale = min(1.0, self.settings.long_side / max(clip.width, clip.height))
         self.width, self.height = (max(1, round(side * self.scale)) for side in (clip.width, clip.height))
+        self.size = np.array([self.width, self.height], np.float32)
         self.estimator_scale = estimator_scale(
             clip.width, clip.height, self.settings.estimator_short_side, self.settings.estimator_long_side
         )
@@ -85,9 +91,9 @@ class Looker:
         if sources.mediapipe is not None:
             self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG)
 
-    def look(self, picture: Picture) -> Seen | str:
+    def detect_frame(self, picture: SourceFrame) -> FrameDetections | str:
         """The person in a frame, or the reason why the frame is dropped."""
-        own = people.territory(picture.index, self.who, self.clip.width, self.clip.height)
+        own = people.subject_region(picture.index, self.people, self.clip.width, self.clip.height)
         estimate = self._estimate(picture, own)
         whole_body = None
         if self.sources.keypoints is not None:
@@ -105,42 +111,40 @@ class Looker:
             return masks
         if masks[0].mean() < self.settings.mask_area:
             return "mask too small"
-        return Seen(landmarks, whole_body, masks)
+        return FrameDetections(landmarks, whole_body, masks)
 
-    def _estimate(self, picture: Picture, own: np.ndarray | None) -> Estimate | None:
+    def _estimate(self, picture: SourceFrame, own: np.ndarray | None) -> Estimate | None:
         if self.estimator is None:
             return None
-        return self.estimator.estimate(resize(people.spotlight(picture.image, own), self.estimator_scale))
+        return self.estimator.estimate(resize(people.hide_others(picture.image, own), self.estimator_scale))
 
     def _whole_body(self, index: int) -> np.ndarray:
         assert self.sources.keypoints is not None
         points = read_whole_body(self.sources.keypoints[index])
         points[:, :2] *= [self.width / self.clip.width, self.height / self.clip.height]
-        points[:, 2] *= inside(points, np.array([self.width, self.height], np.float32))
+        points[:, 2] *= inside_picture(points, self.size)
         points[points[:, 2] <= 0] = 0
         return points
 
-    def _body_points(self, landmarks: Landmarks | None, whole_body: np.ndarray | None) -> np.ndarray:
+    def _body_points(self, landmarks: PixelLandmarks | None, whole_body: np.ndarray | None) -> np.ndarray:
         """The body's points, [17, 3] or [33, 3], with scores that are 0 outside the picture."""
         if whole_body is not None:
             return whole_body[BODY]
         assert landmarks is not None
         points = landmarks.pose[:, [0, 1, 3]].copy()
-        points[:, 2] *= inside(points, np.array([self.width, self.height], np.float32))
+        points[:, 2] *= inside_picture(points, self.size)
         return points
 
     def _masks(
-        self, picture: Picture, estimate: Estimate | None, own: np.ndarray | None
+        self, picture: SourceFrame, estimate: Estimate | None, own: np.ndarray | None
     ) -> tuple[np.ndarray, ...] | str:
-        """Somebody else's mask, or the estimator's two; or the reason why there is none."""
+        """Another program's mask, or the estimator's two; or the reason why there is none."""
         size = (self.width, self.height)
         if self.sources.masks is not None:
             file = self.sources.masks.get(picture.index)
-            return (
-                (read_foreign_mask(file, *size, self.sources.mask_kind).astype(np.float32) / 255,)
-                if file
-                else "no mask file"
-            )
+            if file is None:
+                return "no mask file"
+            return (read_given_mask(file, *size, self.sources.mask_kind).astype(np.float32) / 255,)
         if estimate is None:
             return "no person found"
         both = (estimate.body_mask, estimate.selfie_mask)
@@ -151,74 +155,70 @@ class Looker:
         return tuple(masks)
 
 
-def count_people(context: Context, clip: Clip, sources: Sources) -> tuple[people.Survey, int]:
-    """Search some frames for people; who is in the clip, and how many frames it has (0: unknown)."""
+def count_people(context: Context, clip: Clip, sources: DetectionSources) -> tuple[people.ClipPeople, int]:
+    """The people found in some frames of a clip, and how many frames it has (0: unknown)."""
     settings = context.settings
     if sources.mediapipe is None:
-        return people.Survey(None, (), 0), 0
-    finder = Finder(sources.mediapipe, context.work / NATIVE_LOG)
-    every = max(1, round((clip.fps or LOOKS_A_SECOND) / settings.stride / LOOKS_A_SECOND))
-    looks, total = [], 0
+        return people.ClipPeople(None, (), 0), 0
+    detector = people.PersonDetector(sources.mediapipe, context.work / NATIVE_LOG)
+    every = max(1, round((clip.fps or SEARCHES_A_SECOND) / settings.stride / SEARCHES_A_SECOND))
+    found, total = [], 0
     with context.progress(_expected(clip, settings), "people") as progress:
         for picture in read_clip(clip, settings.stride, settings.max_frames):
             if total % every == 0:
-                looks.append((picture.index, finder.find(picture.image)))
+                found.append((picture.index, detector.detect(picture.image)))
             total += 1
             progress.advance()
-    who = people.survey(looks, clip.width, clip.height)
-    if who.count > 1:
-        context.log(f"{who.count} people at once: the largest and most central one is kept")
-    return who, total
+    everyone = people.track_people(found, clip.width, clip.height)
+    if everyone.count > 1:
+        context.log(f"{everyone.count} people at once: the largest and most central one is kept")
+    return everyone, total
 
 
-def detect(context: Context, clip: Clip, sources: Sources, raw_masks: Path) -> Detected:
-    """Look at every frame, write the kept ones to ``output/frames`` and their raw masks to ``raw_masks``.
+def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: Path) -> DetectedClip:
+    """Detect the person in every frame; write kept frames to ``output/frames``, raw masks to ``raw_masks``.
 
     Raises:
         UserError: a damaged frame, or a keypoint or mask file that is damaged or of no frame.
     """
     settings = context.settings
-    who, total = count_people(context, clip, sources)
-    looker = Looker(context, clip, sources, who)
-    kept: list[tuple[int, float, Seen]] = []
+    everyone, total = count_people(context, clip, sources)
+    detector = FrameDetector(context, clip, sources, everyone)
+    kept: list[tuple[int, float, FrameDetections]] = []
     dropped: Counter[str] = Counter()
     numbers: set[int] = set()
     with context.progress(total or _expected(clip, settings), "frames") as progress:
         for picture in read_clip(clip, settings.stride, settings.max_frames):
             numbers.add(picture.index)
-            seen = looker.look(picture)
+            seen = detector.detect_frame(picture)
             if isinstance(seen, str):
                 dropped[seen] += 1
             else:
-                image = cv2.resize(picture.image, (looker.width, looker.height), interpolation=cv2.INTER_AREA)
+                image = cv2.resize(
+                    picture.image, (detector.width, detector.height), interpolation=cv2.INTER_AREA
+                )
                 write_frame(context.output / "frames", picture.index, image)
                 if len(seen.masks) == 1:
                     write_mask(raw_masks, picture.index, np.round(seen.masks[0] * 255).astype(np.uint8))
                 else:
-                    write_raw(raw_masks, picture.index, *seen.masks)
+                    write_segmentations(raw_masks, picture.index, *seen.masks)
                 kept.append((picture.index, picture.seconds, dataclasses.replace(seen, masks=())))
             progress.advance()
-    for files in (sources.keypoints, sources.masks):
-        check_frames(files or {}, numbers, complete=settings.stride == 1 and not settings.max_frames)
-    return Detected(
-        keypoints=_stack(kept, looker),
-        seconds=tuple(seconds for _, seconds, _ in kept),
-        width=looker.width,
-        height=looker.height,
-        scale=looker.scale,
-        read=len(numbers),
-        dropped=dict(sorted(dropped.items())),
-        people=who.count,
-    )
+    if settings.stride == 1 and not settings.max_frames:
+        for files in (sources.keypoints, sources.masks):
+            check_frames(files or {}, numbers)
+    seconds, dropped_for = tuple(seconds for _, seconds, _ in kept), dict(sorted(dropped.items()))
+    size = (detector.width, detector.height, detector.scale)
+    return DetectedClip(_stack(kept, detector), seconds, *size, len(numbers), dropped_for, everyone.count)
 
 
-def _stack(kept: list[tuple[int, float, Seen]], looker: Looker) -> Keypoints:
+def _stack(kept: list[tuple[int, float, FrameDetections]], detector: FrameDetector) -> Keypoints:
     frames = np.array([index for index, _, _ in kept], np.int64)
     blank = empty_keypoints(np.zeros(1, np.int64))
-    nothing = Landmarks(blank.pose_image[0], blank.pose_world[0], blank.face_mesh[0], blank.hands[0])
+    nothing = PixelLandmarks(blank.pose_image[0], blank.pose_world[0], blank.face_mesh[0], blank.hands[0])
     landmarks = [seen.landmarks or nothing for _, _, seen in kept]
-    magnification = looker.estimator_scale / looker.scale
-    keypoints = to_keypoints(frames, landmarks, looker.width, looker.height, magnification)
+    magnification = detector.estimator_scale / detector.scale
+    keypoints = to_keypoints(frames, landmarks, detector.width, detector.height, magnification)
     for row, (_, _, seen) in enumerate(kept):
         if seen.whole_body is not None:
             keypoints.whole_body[row] = seen.whole_body

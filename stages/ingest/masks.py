@@ -3,13 +3,13 @@
 The pose model's segmentation knows which body is meant and has limbs and feet, but is blurred; the
 selfie segmentation is sharp about heads and shoulders, but takes in furniture and other people. How
 far the two agree over the clip says how far the second can be trusted. What is known of a background
-that stands still is then taken out, the edge drawn to the picture's edges, and the masks made to agree
-from frame to frame: an avatar cannot score higher than the masks agree with one another.
+that stands still is then taken out, the edge is moved to the picture's edges, and the masks are
+averaged along the motion: an avatar cannot score higher than the masks agree with one another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,9 +18,9 @@ import numpy as np
 
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints
-from stages.ingest.background import learn, log_odds, take_out
-from stages.ingest.edges import follow_edges
-from stages.ingest.steady import steady
+from stages.ingest.background import learn_background, log_odds, subtract_background
+from stages.ingest.mask_edges import follow_edges
+from stages.ingest.mask_smoothing import smooth_masks
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -28,60 +28,59 @@ if TYPE_CHECKING:
 TRUSTED = 0.5  # the selfie mask's share where it agrees with the pose mask
 STRANGE, AGREEING = 0.78, 0.90  # median overlap of the two: share 0, full share
 SHARPEN = 1.5  # contrast of the final mask about one half
-SEED_SCORE = 0.5
+SEED_SCORE = 0.5  # of a body point that surely lies on the person
 HOLE = 0.004  # smaller ones, of the person's area, are a mistake; the gap under an arm is larger
 
-Pairs = Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
 
-
-def write_raw(folder: Path, index: int, body: np.ndarray, selfie: np.ndarray) -> None:
+def write_segmentations(folder: Path, index: int, body: np.ndarray, selfie: np.ndarray) -> None:
     """Keep a frame's two segmentations, each [H, W] in [0, 1], as the channels of one picture."""
     channels = np.stack([body, selfie, np.zeros_like(body)], axis=-1)
     write_frame(folder, index, np.round(np.clip(channels, 0, 1) * 255).astype(np.uint8))
 
 
-def read_raw(folder: Path, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """What :func:`write_raw` kept: the pose model's and the selfie segmentation, [H, W] float32."""
+def read_segmentations(folder: Path, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """The pose model's and the selfie segmentation that were kept of a frame, each [H, W] float32."""
     channels = read_frame(folder, index).astype(np.float32) / 255
     return channels[..., 0], channels[..., 1]
 
 
 def refine_masks(context: Context, keypoints: Keypoints, raw: Path) -> None:
-    """Turn the two segmentations of each kept frame into one mask in ``output/masks``.
+    """Write one mask of each kept frame, made of its two segmentations, to ``output/masks``.
 
     Args:
         context: the stage's.
-        keypoints: of the kept frames; its points say which part of a mask is the person.
-        raw: the folder that :func:`write_raw` filled.
+        keypoints: of the kept frames; its points show which part of a mask is the person.
+        raw: the folder that :func:`write_segmentations` filled.
     """
     settings, output = context.settings, context.output
     frames = keypoints.frames.tolist()
-    share = selfie_share([overlap(*read_raw(raw, frame)) for frame in frames])
+    share = selfie_share([overlap(*read_segmentations(raw, frame)) for frame in frames])
     context.log(f"masks: pose {1 - share:.2f}, selfie {share:.2f}")
 
     def fused() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for frame in frames:
-            yield read_frame(output / "frames", frame), fuse(*read_raw(raw, frame), share)
+            yield read_frame(output / "frames", frame), fuse(*read_segmentations(raw, frame), share)
 
-    background = learn(fused()) if settings.background else None
-    model = background.model() if background else None
+    background = learn_background(fused()) if settings.background else None
 
     def cut() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for row, (image, alpha) in enumerate(fused()):
-            if model is not None:
-                alpha = take_out(alpha, image, model)
-            alpha = fill_holes(main_component(alpha, seeds(keypoints.whole_body[row])))
+            if background is not None:
+                alpha = subtract_background(alpha, image, background)
+            points = keypoints.whole_body[row, BODY]
+            seeds = points[points[:, 2] >= SEED_SCORE, :2]
+            alpha = fill_holes(main_component(alpha, seeds))
             yield image, follow_edges(alpha, image, settings.mask_edge)
 
     with context.progress(len(frames), "masks") as progress:
-        for frame, alpha in zip(frames, steady(cut(), settings.mask_steadiness), strict=True):
+        for frame, alpha in zip(frames, smooth_masks(cut(), settings.mask_steadiness), strict=True):
             sharp = np.clip((alpha - 0.5) * SHARPEN + 0.5, 0, 1)
             write_mask(output / "masks", frame, np.round(sharp * 255).astype(np.uint8))
             progress.advance()
 
 
-def copy_masks(context: Context, frames: Sequence[int], raw: Path) -> None:
-    """Publish masks that somebody else made as they are."""
+def publish_given_masks(context: Context, frames: Sequence[int], raw: Path) -> None:
+    """Copy masks that came with the footage to ``output/masks`` as they are."""
     for frame in frames:
         write_mask(context.output / "masks", frame, read_mask(raw, frame))
 
@@ -106,19 +105,13 @@ def fuse(body: np.ndarray, selfie: np.ndarray, share: float) -> np.ndarray:
     return (1 / (1 + np.exp(-odds))).astype(np.float32)
 
 
-def seeds(points: np.ndarray) -> np.ndarray:
-    """The body points of [133, 3] that surely lie on the person, [N, 2]."""
-    return points[BODY][points[BODY, 2] >= SEED_SCORE, :2]
-
-
 def main_component(alpha: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The mask without the parts that do not hang together with the person.
+    """The mask without components that are not the person's, [H, W] float32.
 
     Args:
         alpha: [H, W] in [0, 1].
-        seeds: [N, 2], points on the person in pixels; the component that holds most of them, and all
-            components at least a tenth as large that hold one, are kept. With no seed on any
-            component the largest is kept, and with no component at all the mask stays as it is.
+        seeds: [N, 2], points on the person, pixels. The component that holds most of them is kept, and all
+            at least a tenth as large that hold one; without a seed the largest; without a component all.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats((alpha > 0.5).astype(np.uint8), connectivity=8)
     if count <= 1:
@@ -140,11 +133,7 @@ def main_component(alpha: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 
 def fill_holes(alpha: np.ndarray) -> np.ndarray:
-    """The mask without small holes, [H, W]: they take the values that surround them.
-
-    Args:
-        alpha: [H, W] in [0, 1].
-    """
+    """The mask [H, W] in [0, 1] with small holes filled from what surrounds them."""
     solid = (alpha > 0.5).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - solid, connectivity=4)
     small = stats[:, cv2.CC_STAT_AREA] < HOLE * solid.sum()

@@ -1,21 +1,30 @@
-"""Who is in the clip, and which one is kept: the largest and most central person.
+"""The people in a clip, and the one that is kept: the largest and most central person.
 
-The finder's detections in some frames are linked into tracks; the track with the greatest sum of size
-times centrality is the subject's. Where others stand beside the subject, the picture is shared out
-between the people, and the estimator is shown the subject's part only. The finder does not notice
-people who are small in the picture; the estimator does not mistake them for the subject either.
+Detections in some frames are linked into tracks; the track with the greatest sum of size times centrality
+is the subject's. Where others stand beside the subject, the picture is divided between the people, and the
+estimator is shown the subject's part only. The detector overlooks people who are small in the picture; the
+estimator does not mistake them for the subject either.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-REACH = 0.6  # how far a person may move between two looks, in torso lengths
+from pipeline.detection.mediapipe import BLANK, load_mediapipe, native_errors_to
+
+_GRAPH = """
+input_stream: "image"
+output_stream: "detections"
+node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
+"""
+REACH = 0.6  # how far a person may move between two searches, in torso lengths
 GROWTH = 2.0  # and grow or shrink
-PERSISTENT = 0.2  # a track seen in a smaller part of the looks is a false alarm
+PERSISTENT = 0.2  # a track seen in a smaller part of the searches is a false alarm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +44,36 @@ class Person:
     score: float
 
 
+class PersonDetector:
+    """MediaPipe's person detector, which finds every person in a picture and follows nobody."""
+
+    def __init__(self, asset: Path, native_log: Path) -> None:
+        """Load it; arguments and errors as those of :class:`pipeline.detection.mediapipe.Estimator`."""
+        load_mediapipe(asset)
+        self._native_log = native_log
+        from google.protobuf import text_format
+
+        base = importlib.import_module("mediapipe.python.solution_base")
+        messages = importlib.import_module("mediapipe.framework.calculator_pb2")
+        graph = text_format.Parse(_GRAPH, messages.CalculatorGraphConfig())
+        with native_errors_to(native_log):
+            self._graph = base.SolutionBase(graph_config=graph, outputs=["detections"])
+            self._graph.process(BLANK)
+
+    def detect(self, image: np.ndarray) -> list[Person]:
+        """The people in ``image`` [H, W, 3] uint8 RGB; coordinates in its pixels."""
+        height, width = image.shape[:2]
+        with native_errors_to(self._native_log):
+            found = self._graph.process(image).detections or []
+        people = []
+        for detection in found:
+            points = [(p.x * width, p.y * height) for p in detection.location_data.relative_keypoints]
+            hips, rim, shoulders = (np.array(point) for point in points[:3])
+            radius = float(np.linalg.norm(rim - hips))
+            people.append(Person(hips, shoulders, radius, float(detection.score[0])))
+        return people
+
+
 @dataclasses.dataclass
 class Track:
     """One person's detections, frame number -> detection, in order."""
@@ -47,8 +86,8 @@ class Track:
 
 
 @dataclasses.dataclass(frozen=True)
-class Survey:
-    """Everyone in the clip.
+class ClipPeople:
+    """Everyone in a clip.
 
     Attributes:
         subject: the kept person's track; None where nobody was found.
@@ -61,34 +100,33 @@ class Survey:
     count: int
 
 
-def survey(looks: Sequence[tuple[int, list[Person]]], width: int, height: int) -> Survey:
-    """Link detections and choose the subject.
+def track_people(found: Sequence[tuple[int, list[Person]]], width: int, height: int) -> ClipPeople:
+    """The tracks of all people, and which of them is the subject's.
 
     Args:
-        looks: (frame number, the people found in it), in order.
+        found: (frame number, the people detected in it), in order.
         width, height: the picture's size in pixels.
     """
-    tracks = link(looks)
-    least = max(2, round(PERSISTENT * len(looks))) if len(looks) > 2 else 1
+    tracks = link_detections(found)
+    least = max(2, round(PERSISTENT * len(found))) if len(found) > 2 else 1
     tracks = [track for track in tracks if len(track.people) >= least]
     if not tracks:
-        return Survey(None, (), 0)
+        return ClipPeople(None, (), 0)
 
     def weight(track: Track) -> float:
         return sum(prominence(one, width, height) for one in track.people.values())
 
     subject = max(tracks, key=weight)
-    frames = [frame for frame, _ in looks]
-    count = max(sum(frame in track.people for track in tracks) for frame in frames)
+    count = max(sum(frame in track.people for track in tracks) for frame, _ in found)
     # A track that never coincides with the subject's is the subject, lost and found again.
     others = [track for track in tracks if track is not subject and set(track.people) & set(subject.people)]
-    return Survey(subject, tuple(others), max(count, 1))
+    return ClipPeople(subject, tuple(others), max(count, 1))
 
 
-def link(looks: Sequence[tuple[int, list[Person]]]) -> list[Track]:
+def link_detections(found: Sequence[tuple[int, list[Person]]]) -> list[Track]:
     """Tracks of detections that follow one another closely, the nearest pairs first."""
     tracks: list[Track] = []
-    for frame, people in looks:
+    for frame, people in found:
         last = [track.people[next(reversed(track.people))] for track in tracks]
         pairs = sorted(
             (float(np.linalg.norm(before.shoulders - now.shoulders)), row, column)
@@ -114,7 +152,7 @@ def prominence(person: Person, width: int, height: int) -> float:
     return person.radius * (1 - 0.5 * float(np.linalg.norm(place - centre) / np.linalg.norm(centre)))
 
 
-def territory(frame: int, people: Survey, width: int, height: int) -> np.ndarray | None:
+def subject_region(frame: int, people: ClipPeople, width: int, height: int) -> np.ndarray | None:
     """The subject's part of the picture, [H, W] bool; None where nobody else is about.
 
     A pixel belongs to the person whose axis (hips to head) is nearest, measured in that person's size.
@@ -126,7 +164,7 @@ def territory(frame: int, people: Survey, width: int, height: int) -> np.ndarray
     return np.all([mine <= _distance(other, width, height) for other in others], axis=0)
 
 
-def spotlight(image: np.ndarray, own: np.ndarray | None) -> np.ndarray:
+def hide_others(image: np.ndarray, own: np.ndarray | None) -> np.ndarray:
     """``image`` with everything outside the subject's part painted in its mean colour."""
     if own is None:
         return image

@@ -1,4 +1,4 @@
-"""A contact sheet of what was ingested, to look at before anything is built on it."""
+"""The contact sheet ``preview.png`` of what was ingested."""
 
 from __future__ import annotations
 
@@ -38,17 +38,20 @@ def draw_frame(image: np.ndarray, mask: np.ndarray, points: np.ndarray, threshol
     return drawn
 
 
-def write_preview(path: Path, frames: Path, masks: Path, keypoints: Keypoints) -> None:
-    """Write the contact sheet of at most twelve frames spread over the clip."""
+def write_preview(output: Path, keypoints: Keypoints) -> None:
+    """Write the contact sheet of at most twelve frames, with ``frames`` and ``masks`` in ``output``."""
     rows = spread_end_to_end(range(len(keypoints.frames)), FEW)
-    tiles = [_tile(frames, masks, keypoints, row) for row in rows]
+    tiles = [_tile(output, keypoints, row) for row in rows]
     columns = 4 if tiles[0].shape[1] >= tiles[0].shape[0] else 6
-    write_png(path, contact_sheet(tiles, min(columns, len(tiles))))  # cameras of one rig may differ in size
+    write_png(
+        output / "preview.png", contact_sheet(tiles, min(columns, len(tiles)))
+    )  # cameras of one rig may differ in size
 
 
-def _tile(frames: Path, masks: Path, keypoints: Keypoints, row: int) -> np.ndarray:
+def _tile(output: Path, keypoints: Keypoints, row: int) -> np.ndarray:
     index = int(keypoints.frames[row])
-    drawn = draw_frame(read_frame(frames, index), read_mask(masks, index), keypoints.whole_body[row])
+    image, mask = read_frame(output / "frames", index), read_mask(output / "masks", index)
+    drawn = draw_frame(image, mask, keypoints.whole_body[row])
     scale = TILE / max(drawn.shape[:2])
     tile = cv2.resize(drawn, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     cv2.putText(tile, str(index), (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)

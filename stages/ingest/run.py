@@ -1,7 +1,7 @@
 """The ingest stage: footage in; frames, masks, cameras, keypoints and the split out.
 
-Three passes over the clip, none of which keeps it in memory: who is in it, what is seen of the chosen
-person in each frame, and the masks, which look a few frames back and ahead. What a dataset brings (see
+Three passes over the clip, none of which keeps it in memory: the people in it, the detections of the chosen
+person in each frame, and the masks, which are averaged over a few frames. What a dataset brings (see
 ``datasets``) takes the place of what would be estimated.
 """
 
@@ -14,9 +14,9 @@ from pipeline.clip.records import Footage, write_cameras, write_footage, write_s
 from pipeline.errors import UserError
 from pipeline.pose_files import RECORD, write_record
 from stages.ingest.datasets import Recording, open_recording
-from stages.ingest.mannequin.publish import run_mannequin
+from stages.ingest.mannequin.footage import run_mannequin
 from stages.ingest.preview import write_preview
-from stages.ingest.shots import Ingested, because, ingest_recording
+from stages.ingest.shots import Ingested, drop_reasons, ingest_recording
 from stages.ingest.split import split_recording
 
 if TYPE_CHECKING:
@@ -53,15 +53,15 @@ def run(context: Context) -> None:
     write_footage(output / "footage.json", describe(recording, found))
     if found.poses is not None:
         write_record(output / RECORD, found.poses)
-    write_preview(output / "preview.png", output / "frames", output / "masks", detected.keypoints)
+    write_preview(output, detected.keypoints)
     context.log(
         f"{len(frames)} of {detected.read} frames of {detected.width}x{detected.height} kept, "
-        f"{len(split.test)} of them held out{because(detected.dropped)}"
+        f"{len(split.test)} of them held out{drop_reasons(detected.dropped)}"
     )
 
 
 def describe_layout(recording: Recording) -> str:
-    """One line on what the dataset brings."""
+    """The log's line on a dataset's layout and what it brings."""
     shot = recording.shots[0]
     parts = {
         "cameras": shot.calibration, "masks": shot.masks, "keypoints": shot.keypoints, "poses": shot.poses,

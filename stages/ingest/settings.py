@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
@@ -18,8 +18,13 @@ from pipeline.config.settings import (
     Side,
     setting,
 )  # fmt: skip
-from stages.ingest.layouts import Layout
-from stages.ingest.mannequin.spec import Detector, FilmedFrames, Framing, Noise, UnseenView, check_motion
+from stages.ingest.mannequin.spec import Detector, FrameCount, Framing, Noise, UnseenView, check_motion
+
+Layout = Literal[
+    "zju", "wildavatar", "insta", "xhumans", "persona", "pose2sim", "neuman", "prepared", "talkshow", "plain"
+]  # fmt: skip
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
+"""The layouts of ``stages/ingest/datasets``, in the order in which a folder is tried."""
 
 TestFraction = Annotated[float, Field(ge=0, le=0.9)]
 Focal = Annotated[float, Field(ge=0.1, le=100)]
@@ -35,9 +40,7 @@ class IngestSettings:
     long_side: Side = setting(512, "pixels; larger footage is stored at this size, smaller footage as it is")
     stride: Count = setting(1, "every stride-th frame is looked at")
     max_frames: CountOrNone = setting(0, "how many frames are looked at, 0 for all")
-    layout: Literal["auto", Layout] = setting(
-        "auto", "how the source lies on disk: plain, or a dataset's, see layouts.py"
-    )
+    layout: Literal["auto", Layout] = setting("auto", "how the source lies on disk: plain, or a dataset's")
     keypoints: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of mmpose/DWPose JSON, one a frame"
     )
@@ -85,7 +88,7 @@ class IngestSettings:
     mannequin_motion: str = setting(
         "", "names of its motions joined by '+', or a BVH file; empty for what suits"
     )
-    mannequin_frames: FilmedFrames = setting(60, "how many frames are filmed")
+    mannequin_frames: FrameCount = setting(60, "how many frames are filmed")
     mannequin_size: Side = setting(256, "pixels, both sides of the picture")
     mannequin_fps: FrameRate = setting(25.0, "frames a second")
     mannequin_seed: Seed = setting(0, "of the motion, the detector's errors and the picture's grain")
@@ -106,5 +109,5 @@ class IngestSettings:
 
     @property
     def uses_estimator(self) -> bool:
-        """Whether MediaPipe may have to look at the footage."""
+        """True where MediaPipe may have to look at the footage."""
         return not self.mannequin and bool({"mediapipe", "auto"} & {self.keypoints, self.masks})

@@ -1,4 +1,4 @@
-"""One camera's footage seen through, and several put together."""
+"""The ingest of one camera's footage, and of several as one clip."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import dataclasses
 import shutil
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from pipeline.clip.camera import Camera
 from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses, on_frames
-from stages.ingest.cameras.apply import apply_cameras
-from stages.ingest.cameras.calibration import open_calibration
-from stages.ingest.cameras.choose import choose_cameras
-from stages.ingest.datasets import Recording, Shot
-from stages.ingest.datasets.recording import STEP
-from stages.ingest.detect import Detected, detect
-from stages.ingest.masks import copy_masks, refine_masks
-from stages.ingest.sources import open_sources
+from stages.ingest.cameras.calibration_files import open_calibration
+from stages.ingest.cameras.choose import ClipCameras, choose_cameras
+from stages.ingest.cameras.distortion import undistort_frames
+from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, join_poses
+from stages.ingest.detect import DetectedClip, detect
+from stages.ingest.external_detections import open_sources
+from stages.ingest.masks import publish_given_masks, refine_masks
 from stages.ingest.video import Clip
 
 if TYPE_CHECKING:
@@ -34,18 +33,18 @@ LEAST_FRAMES = 2
 
 @dataclasses.dataclass(frozen=True)
 class Ingested:
-    """What came of a shot; frames and masks are on disk.
+    """An ingested shot, whose frames and masks are on disk.
 
     Attributes:
         detected: of the kept frames.
         cameras: frame number -> camera.
         camera_record: for ``footage.json``.
-        names: what keypoints and masks came from.
+        names: the sources of keypoints and masks.
         poses: of the kept frames, or None.
-        timings: seconds by what they went into.
+        timings: seconds, by step.
     """
 
-    detected: Detected
+    detected: DetectedClip
     cameras: Mapping[int, Camera]
     camera_record: Mapping[str, Any]
     names: Mapping[str, str]
@@ -56,14 +55,14 @@ class Ingested:
 def ingest_shot(
     context: Context, shot: Shot, layout: str, span: range | None = None, least: int = LEAST_FRAMES
 ) -> Ingested:
-    """See a shot through: keypoints, masks and cameras of its frames.
+    """Write frames and masks of a shot, and find its keypoints and cameras.
 
     Args:
         context: the stage's.
         shot: the footage and what came with it.
         layout: the dataset's.
         span: the frame numbers that are this shot's, where there are several.
-        least: how many frames with a person there must be.
+        least: the fewest frames with a person.
 
     Raises:
         UserError: the footage, or what came with it, cannot be used; names the file and the remedy.
@@ -84,12 +83,12 @@ def ingest_shot(
     if sources.masks is None:
         refine_masks(context, detected.keypoints, raw_masks)
     else:
-        copy_masks(context, detected.keypoints.frames.tolist(), raw_masks)
+        publish_given_masks(context, detected.keypoints.frames.tolist(), raw_masks)
     timings = {"detect_seconds": seen - started, "mask_seconds": time.perf_counter() - seen}
     shutil.rmtree(raw_masks)
 
     chosen = choose_cameras(context, clip, detected, calibration, shot.poses)
-    detected = apply_cameras(output, detected, chosen.cameras, chosen.lenses)
+    detected = apply_cameras(output, detected, chosen)
     check_enough(clip, detected, least)
     frames = detected.keypoints.frames.tolist()
     poses = None if shot.poses is None else on_frames(shot.poses, frames)
@@ -97,7 +96,28 @@ def ingest_shot(
     return Ingested(detected, cameras, chosen.record, sources.names, poses, timings)
 
 
-def check_enough(clip: Clip, detected: Detected, least: int) -> None:
+def apply_cameras(output: Path, detected: DetectedClip, chosen: ClipCameras) -> DetectedClip:
+    """The clip that fits its cameras: frames without one are removed and counted, distortion is taken out.
+
+    Frames and masks are changed in place in ``output``.
+    """
+    frames = detected.keypoints.frames.tolist()
+    rows = [row for row, frame in enumerate(frames) if frame in chosen.cameras]
+    for frame in set(frames) - chosen.cameras.keys():
+        for folder in ("frames", "masks"):
+            (output / folder / f"{frame:06d}.png").unlink()
+    dropped = dict(detected.dropped)
+    if len(rows) < len(frames):
+        dropped["no camera"] = len(frames) - len(rows)
+    keypoints = detected.keypoints.select(np.array(rows, int))
+    if chosen.lenses:
+        keypoints = undistort_frames(output, chosen.lenses, keypoints)
+    seconds = tuple(detected.seconds[row] for row in rows)
+    dropped = dict(sorted(dropped.items()))
+    return dataclasses.replace(detected, keypoints=keypoints, seconds=seconds, dropped=dropped)
+
+
+def check_enough(clip: Clip, detected: DetectedClip, least: int) -> None:
     """UserError where too few frames were read, or too few hold a person."""
     kept, read = len(detected.keypoints.frames), detected.read
     if read < least:
@@ -105,13 +125,13 @@ def check_enough(clip: Clip, detected: Detected, least: int) -> None:
     if kept < least:
         seen = f"a person in {kept} of {read} frames only" if kept else f"no person in any of {read} frames"
         raise UserError(
-            f"{clip.path} shows {seen}{because(detected.dropped)}: "
+            f"{clip.path} shows {seen}{drop_reasons(detected.dropped)}: "
             "give a clip in which one person is seen clearly"
         )
 
 
-def because(dropped: Mapping[str, int]) -> str:
-    """Why frames were dropped, in brackets; empty where none was."""
+def drop_reasons(dropped: Mapping[str, int]) -> str:
+    """The reasons why frames were dropped, in brackets; empty where none was."""
     return f" ({', '.join(f'{reason}: {count}' for reason, count in dropped.items())})" if dropped else ""
 
 
@@ -122,44 +142,26 @@ def ingest_recording(context: Context, recording: Recording) -> Ingested:
         return ingest_shot(context, recording.shots[0], layout)
     parts = [
         ingest_shot(
-            context, shot, layout, range(place * STEP, (place + 1) * STEP), 1 if place else LEAST_FRAMES
+            context,
+            shot,
+            layout,
+            range(place * SHOT_STEP, (place + 1) * SHOT_STEP),
+            1 if place else LEAST_FRAMES,
         )
         for place, shot in enumerate(recording.shots)
     ]
-    dropped: Counter[str] = Counter()
-    for part in parts:
-        dropped.update(part.detected.dropped)
     first = parts[0]
+    clips = [part.detected for part in parts]
     detected = dataclasses.replace(
         first.detected,
-        keypoints=_joined([part.detected.keypoints for part in parts]),
-        seconds=tuple(second for part in parts for second in part.detected.seconds),
-        read=sum(part.detected.read for part in parts),
-        dropped=dict(sorted(dropped.items())),
-        people=max(part.detected.people for part in parts),
+        keypoints=Keypoints.concatenate([clip.keypoints for clip in clips]),
+        seconds=tuple(second for clip in clips for second in clip.seconds),
+        read=sum(clip.read for clip in clips),
+        dropped=dict(sorted(sum((Counter(clip.dropped) for clip in clips), Counter()).items())),
+        people=max(clip.people for clip in clips),
     )
     cameras = {frame: camera for part in parts for frame, camera in part.cameras.items()}
     timings = {name: sum(part.timings[name] for part in parts) for name in first.timings}
     record = {**first.camera_record, "shots": len(parts)}
     poses = join_poses([part.poses for part in parts])
     return Ingested(detected, cameras, record, first.names, poses, timings)
-
-
-def _joined(keypoints: Sequence[Keypoints]) -> Keypoints:
-    fields = [field.name for field in dataclasses.fields(Keypoints)]
-    return Keypoints(**{name: np.concatenate([getattr(one, name) for one in keypoints]) for name in fields})
-
-
-def join_poses(poses: Sequence[InitialPoses | None]) -> InitialPoses | None:
-    """Poses of several shots as one; None where a shot has none."""
-    known = [one for one in poses if one is not None]
-    if not known or len(known) < len(poses):
-        return None
-    names = ("rotation", "expression", "transl", "valid", "hand_pca")
-    together: dict[str, Any] = {
-        name: torch.cat([getattr(one, name) for one in known])
-        for name in names
-        if all(getattr(one, name) is not None for one in known)
-    }
-    frames = tuple(frame for one in known for frame in one.frames)
-    return dataclasses.replace(known[0], frames=frames, **together)

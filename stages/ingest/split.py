@@ -1,4 +1,4 @@
-"""Which frames are held out."""
+"""The split of the kept frames into those learnt from and those held out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.ingest.datasets import Recording
 
 
 def split_frames(frames: Sequence[int], fraction: float, last: int) -> Split:
-    """Hold out the clip's end.
+    """The clip's end held out.
 
     Args:
         frames: the kept frames, increasing.
@@ -30,20 +30,12 @@ def split_frames(frames: Sequence[int], fraction: float, last: int) -> Split:
 
 
 def split_recording(recording: Recording, frames: Sequence[int], fraction: float, last: int) -> Split:
-    """The dataset's own split of the kept frames, else the clip's end is held out.
+    """The dataset's own split of the kept frames, else the clip's end held out.
 
-    Args:
-        recording: the dataset's folder.
-        frames: the kept frames, increasing.
-        fraction, last: as for ``split_frames``. ``last`` replaces the dataset's split of a single camera.
-
-    Raises:
-        UserError: nothing is left to learn from.
+    Arguments and errors as those of :func:`split_frames`; ``last`` replaces a single camera's own split.
     """
-    own = recording.train is not None and recording.test is not None
-    if not own or (last and len(recording.shots) == 1):
+    if recording.train is None or recording.test is None or (last and len(recording.shots) == 1):
         return split_frames(frames, fraction, last)
-    assert recording.train is not None and recording.test is not None
     train = tuple(frame for frame in frames if frame in recording.train)
     if not train:
         raise UserError(

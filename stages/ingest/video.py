@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -43,7 +44,7 @@ class Clip:
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
+class SourceFrame:
     """One frame of a clip.
 
     Attributes:
@@ -79,11 +80,10 @@ def open_clip(path: Path) -> Clip:
         return Clip(path, width, height, fps, expected, turns=_turns(first))
 
 
-def read_clip(clip: Clip, stride: int = 1, limit: int = 0) -> Iterator[Picture]:
+def read_clip(clip: Clip, stride: int = 1, limit: int = 0) -> Iterator[SourceFrame]:
     """Every ``stride``-th frame in order, at most ``limit`` of them (0: all), one in memory at a time.
 
-    Frames of a video are counted as they are decoded; their times are their own time stamps, so a
-    variable frame rate needs no resampling.
+    Times are a video's own time stamps, so a variable frame rate needs no resampling.
 
     Raises:
         UserError: a frame is damaged, or its size differs from the first one's.
@@ -125,7 +125,7 @@ def _decode(path: Path, container: av.container.InputContainer) -> Iterator[av.V
         raise UserError(f"{path} is damaged after {count} frames ({error.strerror}): {remedy}") from None
 
 
-def _read_video(clip: Clip, stride: int) -> Iterator[Picture]:
+def _read_video(clip: Clip, stride: int) -> Iterator[SourceFrame]:
     start = 0.0
     with _open(clip.path) as container:
         ratio = container.streams.video[0].sample_aspect_ratio
@@ -133,11 +133,11 @@ def _read_video(clip: Clip, stride: int) -> Iterator[Picture]:
             time = frame.time if frame.time is not None else index / (clip.fps or 1.0)
             start = time if index == 0 else start
             if index % stride == 0:
-                yield Picture(clip.first + index, time - start, _upright(frame, ratio))
+                yield SourceFrame(clip.first + index, time - start, _upright(frame, ratio))
 
 
 def _upright(frame: av.VideoFrame, ratio: Fraction | None) -> np.ndarray:
-    """The frame as it is meant to be seen: square pixels, then the rotation flag (counter-clockwise)."""
+    """The frame with square pixels, turned by its rotation flag: [H, W, 3] uint8 RGB."""
     image: np.ndarray = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     stretch = float(ratio) if ratio else 1.0
     if stretch > 0 and abs(stretch - 1) > 1e-3:
@@ -153,22 +153,63 @@ def _turns(frame: av.VideoFrame) -> int:
 
 
 def _open_folder(path: Path) -> Clip:
-    files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
-    files = [file for file in files if not file.name.startswith(".")]
+    files = _visible_files(path, PICTURES)
     if not files:
         raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): give a folder of frames")
-    pictures = number_files(files)
-    height, width = read_picture(next(iter(pictures.values()))).shape[:2]
-    return Clip(path, width, height, 0.0, len(files), pictures)
+    # A frame's number is its whole name, or else the place in the order of names.
+    by_name = {int(file.stem): file for file in files if file.stem.isdecimal()}
+    pictures = by_name if len(by_name) == len(files) else dict(enumerate(files))
+    return folder_clip(path, pictures)
 
 
-def number_files(files: list[Path]) -> dict[int, Path]:
-    """Frame number -> file: the number that each name consists of, else the place in the order of names."""
-    if all(file.stem.isdecimal() for file in files):
-        numbered = {int(file.stem): file for file in files}
-        if len(numbered) == len(files):
-            return dict(sorted(numbered.items()))
-    return dict(enumerate(files))
+def folder_clip(path: Path, pictures: Mapping[int, Path], fps: float = 0.0) -> Clip:
+    """The clip of some pictures of a folder, frame number -> file.
+
+    Raises:
+        UserError: there are none, or the first is damaged.
+    """
+    if not pictures:
+        raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): unpack the dataset there")
+    ordered = dict(sorted(pictures.items()))
+    height, width = read_picture(next(iter(ordered.values()))).shape[:2]
+    return Clip(path, width, height, fps, len(ordered), ordered)
+
+
+def last_number(name: str) -> int | None:
+    """The last run of digits in a name; what precedes it is a camera, a take or a word."""
+    digits = re.findall(r"\d+", name)
+    return int(digits[-1]) if digits else None
+
+
+def trailing_number(name: str) -> int | None:
+    """The digits that a name ends with."""
+    match = re.search(r"\d+\Z", name)
+    return int(match.group()) if match else None
+
+
+def numbered_files(
+    folder: Path,
+    suffixes: Sequence[str] = PICTURES,
+    number_of: Callable[[str], int | None] = last_number,
+) -> dict[int, Path]:
+    """Frame number -> file, sorted; names without a number are left out. Empty without such a folder.
+
+    Raises:
+        UserError: two files of one frame.
+    """
+    found: dict[int, Path] = {}
+    for file in _visible_files(folder, suffixes) if folder.is_dir() else []:
+        number = number_of(file.stem)
+        if number in found:
+            raise UserError(f"{file} and {found[number].name} both name frame {number}: keep one")
+        if number is not None:
+            found[number] = file
+    return dict(sorted(found.items()))
+
+
+def _visible_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    files = sorted(folder.iterdir())
+    return [file for file in files if file.suffix.lower() in suffixes and not file.name.startswith(".")]
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -181,9 +222,9 @@ def read_picture(path: Path) -> np.ndarray:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def _read_folder(clip: Clip, stride: int) -> Iterator[Picture]:
+def _read_folder(clip: Clip, stride: int) -> Iterator[SourceFrame]:
     begin = next(iter(clip.pictures))
     for place, (index, file) in enumerate(clip.pictures.items()):
         if place % stride == 0:
             seconds = (index - begin) / clip.fps if clip.fps else float(place)
-            yield Picture(index, seconds, read_picture(file))
+            yield SourceFrame(index, seconds, read_picture(file))

@@ -22,7 +22,7 @@ from stages.plan.measure import (
 )
 from stages.plan.settings import PlanSettings
 
-# As in stages/ingest/cameras/motion.py, which is where it decides; a test compares them.
+# As in stages/ingest/cameras/background_motion.py, which is where it decides; a test compares them.
 BACKGROUND_MOTION = 0.03
 
 # Share of a part's vertices. Mannequins: what a framing shows reaches 0.4 and more, what it does not 0.
@@ -34,7 +34,7 @@ RESIDUAL_PIXELS = 32.0
 
 # Pixels from one Gaussian to the next. Whole bodies at 256 to 512 pixels have 1.1: four times as many
 # cost 2.3 to 3.2 times the training and 0.15 dB; an upper body of 2.5 gains a seventh of its LPIPS by them
-# and a head of 3.8 a third (docs/results.md).
+# and a head of 3.8 a third (docs/log/2026-11.md).
 GAUSSIAN_PIXELS = 1.5
 
 # Of the person's size. Mannequins that stand still, head and upper body: 0.031 and 0.028, which is what the

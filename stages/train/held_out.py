@@ -17,8 +17,8 @@ from pipeline.errors import UserError
 from pipeline.metrics.psnr import psnr
 from pipeline.splat import render
 from stages.train import schedule
-from stages.train.hooks import Hook, Log, describe
-from stages.train.loop import Trainer
+from stages.train.hooks import Log, describe
+from stages.train.loop import Hook, Trainer
 from stages.train.settings import TrainSettings
 from stages.train.timer import TrainingTimer
 

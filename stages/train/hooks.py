@@ -4,42 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from pipeline.body import Pose
-from pipeline.clip.views import View
 from pipeline.run.progress import Progress
 from stages.train.checkpoint import write_checkpoint
+from stages.train.loop import Hook, Trainer
 from stages.train.timer import TrainingTimer
-
-if TYPE_CHECKING:
-    from stages.train.loop import Trainer
 
 Log = Callable[[str], None]
 """Writes one line to the terminal."""
-
-
-class Hook:
-    """A hook that does nothing; each of its methods is called by the trainer.
-
-    A checkpoint holds the parameters and buffers of a hook that is a ``torch.nn.Module``, and ``json_state``.
-    """
-
-    def on_start(self, trainer: Trainer) -> None:
-        """Called before the first step of a process, after a checkpoint was restored."""
-
-    def on_frame(self, pose: Pose, view: View) -> None:
-        """Called with the pose in which a frame was rendered, and the frame."""
-
-    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
-        """Called after each step with the weighted loss terms; ``trainer.iteration`` counts the step."""
-
-    def json_state(self) -> dict[str, Any]:
-        """JSON values for a checkpoint."""
-        return {}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Takes back what ``json_state`` gave; an empty dict leaves everything as it is."""
 
 
 class NearestSkinning(Hook):

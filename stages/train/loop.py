@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 
@@ -15,13 +16,35 @@ from pipeline.metrics import Lpips
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import TrainingData
-from stages.train.hooks import Hook
 from stages.train.objective import Objective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
+
+
+class Hook:
+    """A hook that does nothing; each of its methods is called by the trainer.
+
+    A checkpoint holds the parameters and buffers of a hook that is a ``torch.nn.Module``, and ``json_state``.
+    """
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Called before the first step of a process, after a checkpoint was restored."""
+
+    def on_frame(self, pose: Pose, view: View) -> None:
+        """Called with the pose in which a frame was rendered, and the frame."""
+
+    def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
+        """Called after each step with the weighted loss terms; ``trainer.iteration`` counts the step."""
+
+    def json_state(self) -> dict[str, Any]:
+        """JSON values for a checkpoint."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Takes back what ``json_state`` gave; an empty dict leaves everything as it is."""
 
 
 class Trainer:

@@ -17,9 +17,9 @@ from pipeline.run.stage import Context
 from stages.train.checkpoint import NAME, read_checkpoint, run_key
 from stages.train.data import TrainingData, read_training_data
 from stages.train.held_out import WATCHED, HeldOutCurve
-from stages.train.hooks import Checkpoints, Hook, Log, NearestSkinning, ProgressBar
+from stages.train.hooks import Checkpoints, Log, NearestSkinning, ProgressBar
 from stages.train.initial_avatar import initial_avatar
-from stages.train.loop import Trainer
+from stages.train.loop import Hook, Trainer
 from stages.train.objective import describe_objective
 from stages.train.poses import PoseRefinement
 from stages.train.publish import publish

@@ -56,7 +56,7 @@ class TrainSettings:
     held_out_every: Count = setting(250, "iterations between points of the held-out curve")
     held_out_frames: CountOrNone = setting(3, "frames of each such point")
     checkpoint_every: Count = setting(250, "iterations between checkpoints")
-    # On 2 cores one thread is faster at this size (docs/results.md).
+    # One: bytes do not depend on the number of cores. Two are 1.5 times as fast (docs/log/2026-11.md).
     threads: Threads = setting(1, "of the CPU, 0 for all")
     # Equal runs give equal bytes on a CPU only, and the key of an artifact holds this word, not what it came
     # to mean (pipeline/device.py); run.json does.
@@ -82,7 +82,7 @@ class TrainSettings:
         0.4, "fraction of the run from which the pose heads take part; 1: never"
     )
     # A tenth to a seventh of a step at 40,000 Gaussians, nothing at 10,000; turned pictures and held-out
-    # frames are the same (docs/results.md).
+    # frames are the same (docs/log/2026-11.md).
     pose_seen_only: bool = setting(True, "pose and residual heads: only what the frame saw when last drawn")
     # Without it the heads learn each frame by heart.
     pose_noise: Deviation = setting(

@@ -3,7 +3,7 @@
 Each drawn frame shows the body vertices that lie in the crop around the person and in front of the camera.
 That is measured for gated vertices as for all others, by posing the bare body, which costs a millisecond.
 
-The score v_i is the share of the drawn frames (Eq. 7), over captured and generated frames apart, from
+The score v_i is the share of the drawn frames (Eq. 6), over captured and generated frames apart, from
 the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
 the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies below it is gated: it leaves
 ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -37,12 +36,9 @@ from pipeline.clip.views import View, ViewCache
 from pipeline.device import moved
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
-from stages.train.hooks import Hook
+from stages.train.loop import Hook, Trainer
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-
-if TYPE_CHECKING:
-    from stages.train.loop import Trainer
 
 SCHEMA = pa.schema(
     [

@@ -11,10 +11,10 @@ from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import read_keypoints
 from pipeline.clip.records import read_cameras, read_split
 from pipeline.errors import UserError
-from stages.ingest.cameras.lens import distortion, straightened, undistort
+from stages.ingest.cameras.distortion import distortion_pixels, undistort_frames, undistort_points
+from stages.ingest.mask_smoothing import smooth_masks
 from stages.ingest.masks import fill_holes, follow_edges, fuse, main_component, overlap, selfie_share
 from stages.ingest.run import run
-from stages.ingest.steady import steady
 from tests.stages.ingest_clips import body_points, make_context, walking_blob, write_images
 
 
@@ -143,11 +143,11 @@ def lens_of(case):
 @pytest.mark.parametrize("case", LENSES)
 def test_any_lens_has_a_measure_and_leaves_pictures_and_points_finite(tmp_path, case):
     lens = lens_of(case)
-    assert distortion(lens) >= 0 and not math.isnan(distortion(lens))
+    assert distortion_pixels(lens) >= 0 and not math.isnan(distortion_pixels(lens))
     folder = material(tmp_path / "lens", *blob(2))
     output = ingest(folder, test_fraction=0.5)
     points = read_keypoints(output / "keypoints.parquet")
-    moved = undistort(output, {0: lens, 1: lens}, points)
+    moved = undistort_frames(output, {0: lens, 1: lens}, points)
     for name in ("whole_body", "pose_image", "face_mesh", "hands"):
         assert np.isfinite(getattr(moved, name)).all(), name
     lost = moved.whole_body[..., 2] == 0
@@ -157,7 +157,7 @@ def test_any_lens_has_a_measure_and_leaves_pictures_and_points_finite(tmp_path, 
 
 
 def test_a_point_that_no_ray_reaches_is_not_a_number_and_never_published():
-    found = straightened(lens_of("folding"), np.array([[0.0, 0.0], [32.0, 24.0], [1e6, 1e6]]))
+    found = undistort_points(lens_of("folding"), np.array([[0.0, 0.0], [32.0, 24.0], [1e6, 1e6]]))
     assert np.isfinite(found[1]).all()
 
 
@@ -178,7 +178,7 @@ def test_masks_without_an_edge_stay_shares(value):
         follow_edges(alpha, image, 1.0),
     ):
         assert np.isfinite(mask).all() and mask.min() >= 0 and mask.max() <= 1 + 1e-6
-    steadied = list(steady([(image, alpha)] * 3, 2))
+    steadied = list(smooth_masks([(image, alpha)] * 3, 2))
     assert len(steadied) == 3 and all(np.isfinite(mask).all() for mask in steadied)
 
 

@@ -21,7 +21,7 @@ from stages.auxiliary.turn import read_numbered_clip
 from stages.ingest.mannequin.appearance import make_appearance
 from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.footage import Mannequin, make_mannequin
-from stages.ingest.mannequin.framing import Shot
+from stages.ingest.mannequin.framing import FramedMotion
 from stages.ingest.mannequin.person import make_identity
 from stages.ingest.mannequin.scene import film, make_background, make_scene
 from stages.ingest.mannequin.spec import MannequinSpec
@@ -103,6 +103,6 @@ def films(turn, seed: int) -> list[np.ndarray]:
     identity, appearance = make_identity(body, seed), make_appearance(body, landmarks, seed)
     worn = surface_offset(body, appearance.measures, appearance.style)
     clothed = dataclasses.replace(identity, face_offset=identity.face_offset + worn)
-    shot = Shot(turn.camera, torch.zeros(3), turn.poses)
+    shot = FramedMotion(turn.camera, torch.zeros(3), turn.poses)
     scene, background = make_scene(body, clothed, appearance, shot, 0), make_background(turn.camera, 3)
     return [film(scene, row, turn.camera, background).image for row in range(len(turn.poses))]

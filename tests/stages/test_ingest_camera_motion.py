@@ -10,11 +10,16 @@ import torch
 
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import empty_keypoints
+from stages.ingest.cameras.background_motion import MOVING, measure_motion
 from stages.ingest.cameras.choose import choose_cameras
-from stages.ingest.cameras.motion import MOVING, measure_motion
-from stages.ingest.cameras.scale import metric_scale, person_places
-from stages.ingest.cameras.turning import MOSTLY_TURNS, ONLY_TURNS, chain_turns, unexplained_by_turns
-from stages.ingest.detect import Detected
+from stages.ingest.cameras.rotation_only import (
+    MOSTLY_ROTATION,
+    ROTATION_ONLY,
+    chain_rotations,
+    unexplained_by_rotation,
+)
+from stages.ingest.cameras.scale import metric_scale, person_positions
+from stages.ingest.detect import DetectedClip
 from stages.ingest.video import Clip
 from tests.stages.camera_scene import (
     FOCAL,
@@ -59,8 +64,8 @@ def test_a_background_without_corners_counts_as_static(tmp_path: Path) -> None:
 
 def test_a_camera_that_only_turns_is_followed(tmp_path: Path) -> None:
     truth = filmed(tmp_path, sideways=0, degrees=20)
-    assert unexplained_by_turns(tmp_path, range(12), 25.0, MATRIX) < ONLY_TURNS
-    rotations = chain_turns(tmp_path, range(12), MATRIX)
+    assert unexplained_by_rotation(tmp_path, range(12), 25.0, MATRIX) < ROTATION_ONLY
+    rotations = chain_rotations(tmp_path, range(12), MATRIX)
     assert rotations is not None
     assert rotation_error(np.stack(rotations), truth.rotations).max() < 0.1
 
@@ -71,13 +76,13 @@ def sfm_scene(folder: Path, **settings: object):
     truth = filmed(context.output)
     keypoints = person_keypoints(truth, 0.5)
     seconds = tuple(k / 25 for k in range(12))
-    detected = Detected(keypoints, seconds, WIDTH, HEIGHT, 1.0, 12, {}, 1)
+    detected = DetectedClip(keypoints, seconds, WIDTH, HEIGHT, 1.0, 12, {}, 1)
     return context, Clip(Path("clip.mp4"), WIDTH, HEIGHT, 25.0, 12), detected, truth
 
 
 def test_a_moving_camera_is_found_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     context, clip, detected, truth = sfm_scene(tmp_path, focal=FOCAL / WIDTH)
-    assert unexplained_by_turns(context.output, range(12), 25.0, MATRIX) > ONLY_TURNS
+    assert unexplained_by_rotation(context.output, range(12), 25.0, MATRIX) > ROTATION_ONLY
     chosen = choose_cameras(context, clip, detected, None)
     assert chosen.record["source"] == "sfm" and chosen.record["displacement"] > MOVING
     assert chosen.record["placed"] == 12 and chosen.record["interpolated"] == 0
@@ -109,7 +114,7 @@ def test_equal_frames_give_equal_cameras(tmp_path: Path) -> None:
 
 def test_turns_do_not_pass_for_an_orbit(tmp_path: Path) -> None:
     filmed(tmp_path)
-    assert unexplained_by_turns(tmp_path, range(12), 25.0, MATRIX) > MOSTLY_TURNS
+    assert unexplained_by_rotation(tmp_path, range(12), 25.0, MATRIX) > MOSTLY_ROTATION
 
 
 # The metric scale
@@ -118,7 +123,7 @@ def test_turns_do_not_pass_for_an_orbit(tmp_path: Path) -> None:
 def test_the_scale_is_found_from_the_person(tmp_path: Path) -> None:
     truth = camera_path(40)
     unit = 0.37  # metres
-    placed, places = person_places(
+    placed, places = person_positions(
         person_keypoints(truth, 0.3), np.full((40, 2), FOCAL), np.tile(CENTRE, (40, 1))
     )
     assert len(placed) == 40
@@ -138,6 +143,6 @@ def test_the_scale_keeps_the_scene_behind_the_person() -> None:
 
 def test_a_clip_without_3d_landmarks_keeps_its_unit() -> None:
     keypoints = empty_keypoints(np.arange(5))
-    placed, places = person_places(keypoints, np.full((5, 2), FOCAL), np.tile(CENTRE, (5, 1)))
+    placed, places = person_positions(keypoints, np.full((5, 2), FOCAL), np.tile(CENTRE, (5, 1)))
     found = metric_scale(np.stack([np.eye(3)] * 5)[placed], np.zeros((5, 3))[placed], places, 25.0, 4.0)
     assert found.metres == 1.0 and "no 3D landmarks" in found.note

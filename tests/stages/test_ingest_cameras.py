@@ -17,12 +17,17 @@ from pipeline.clip.frames import read_frame, write_frame, write_mask
 from pipeline.clip.keypoints import empty_keypoints, read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, write_cameras
 from pipeline.errors import UserError
-from stages.ingest.cameras.calibration import CalibratedCamera, open_calibration, pinhole_lens
-from stages.ingest.cameras.gaps import fill_gaps
-from stages.ingest.cameras.lens import distortion, pinhole_of, stored_view, straightened, undistort
-from stages.ingest.cameras.motion import MOVING
-from stages.ingest.cameras.numbering import frames_by_name
-from stages.ingest.cameras.world import FACING, settle
+from stages.ingest.cameras.background_motion import MOVING
+from stages.ingest.cameras.calibration import CalibratedCamera, frames_by_name, pinhole_lens
+from stages.ingest.cameras.calibration_files import open_calibration
+from stages.ingest.cameras.distortion import (
+    distortion_pixels,
+    for_stored_frames,
+    undistort_frames,
+    undistort_points,
+    without_distortion,
+)
+from stages.ingest.cameras.extrinsics import FACING, interpolate_gaps, to_upright_world
 from stages.ingest.run import run
 from stages.ingest.video import Clip
 from tests.stages.camera_scene import (
@@ -275,22 +280,24 @@ def test_a_lens_is_turned_and_scaled_with_the_frames(tmp_path: Path) -> None:
     x, y = np.asarray(lens.img_from_cam(rotation @ point + translation))
     for turns, expected in ((1, (y, 200 - x)), (3, (100 - y, x))):
         clip = clip_of(size=(100, 200), turns=turns)
-        view = stored_view(CalibratedCamera(lens, rotation, translation), clip, 50, 100, tmp_path)
+        view = for_stored_frames(CalibratedCamera(lens, rotation, translation), clip, 50, 100, tmp_path)
         found = view.lens.img_from_cam(view.rotation @ point + view.translation)
         np.testing.assert_allclose(found, np.array(expected) / 2, atol=1e-9)
         assert np.linalg.det(view.rotation) == pytest.approx(1)
     with pytest.raises(UserError, match="made for pictures of 200x100"):
-        stored_view(CalibratedCamera(lens, rotation, translation), clip_of(size=(100, 100)), 50, 50, tmp_path)
+        for_stored_frames(
+            CalibratedCamera(lens, rotation, translation), clip_of(size=(100, 100)), 50, 50, tmp_path
+        )
 
 
 def test_distortion_is_taken_out_of_frames_masks_and_points_alike(tmp_path: Path) -> None:
     lens = pycolmap.Camera(model="OPENCV", width=160, height=120, params=[150, 150, 80, 60, -0.3, 0.1, 0, 0])
-    assert distortion(pinhole_of(lens)) == 0 and 4 < distortion(lens) < 20
+    assert distortion_pixels(without_distortion(lens)) == 0 and 4 < distortion_pixels(lens) < 20
     straight = np.array([[30.0, 30.0], [130.0, 90.0], [80.0, 20.0]])  # where the pinhole sees three dots
     rays = np.concatenate([(straight - [80, 60]) / 150, np.ones((3, 1))], axis=1)
     bent = np.asarray(lens.img_from_cam(rays))
     assert np.linalg.norm(bent - straight, axis=1).max() > 2
-    np.testing.assert_allclose(straightened(lens, bent), straight, atol=1e-6)
+    np.testing.assert_allclose(undistort_points(lens, bent), straight, atol=1e-6)
     y, x = np.mgrid[0:120, 0:160] + 0.5
     spots = np.exp(-np.square(np.stack([x, y], -1)[None] - bent[:, None, None]).sum(-1) / 8).sum(0)
     for folder in ("frames", "masks"):
@@ -299,7 +306,7 @@ def test_distortion_is_taken_out_of_frames_masks_and_points_alike(tmp_path: Path
     write_mask(tmp_path / "masks", 0, (spots * 255).astype(np.uint8))
     keypoints = empty_keypoints(np.array([0]))
     keypoints.whole_body[0, :3] = [[*point, 0.9] for point in bent]
-    result = undistort(tmp_path, {0: lens}, keypoints)
+    result = undistort_frames(tmp_path, {0: lens}, keypoints)
     np.testing.assert_allclose(result.whole_body[0, :3, :2], straight, atol=1e-4)
     assert (result.whole_body[0, 3:] == 0).all() and (result.hands == 0).all()
     image = read_frame(tmp_path / "frames", 0)[..., 0].astype(float)
@@ -342,7 +349,7 @@ def test_numbers_are_believed_where_nobody_knows_the_length(tmp_path: Path) -> N
 def test_short_gaps_are_filled_and_long_ones_are_not() -> None:
     turn = Rotation.from_rotvec([0, 0.4, 0]).as_matrix()
     known = {0: (np.eye(3), np.zeros(3)), 4: (turn, -turn @ [1.0, 0, 0]), 20: (np.eye(3), np.zeros(3))}
-    filled = fill_gaps(known, list(range(22)), longest=4)
+    filled = interpolate_gaps(known, list(range(22)), longest=4)
     assert sorted(filled) == [0, 1, 2, 3, 4, 20]
     rotation, translation = filled[1]
     np.testing.assert_allclose(Rotation.from_matrix(rotation).as_rotvec(), [0, 0.1, 0], atol=1e-6)
@@ -351,7 +358,7 @@ def test_short_gaps_are_filled_and_long_ones_are_not() -> None:
 
 def test_the_world_of_one_camera_is_the_facing_one() -> None:
     rotation, translation = poses(6)[5]
-    rotations, translations = settle(np.stack([rotation] * 3), np.stack([translation] * 3))
+    rotations, translations = to_upright_world(np.stack([rotation] * 3), np.stack([translation] * 3))
     np.testing.assert_allclose(rotations, np.stack([FACING] * 3), atol=1e-12)
     np.testing.assert_allclose(translations, 0, atol=1e-12)
 

@@ -24,7 +24,7 @@ from pipeline.pose_files import RECORD, read_record, with_flat_hands
 from stages.fit.initial_poses import keep_given
 from stages.fit.views import stack
 from stages.ingest.datasets.neuman import official_split
-from stages.ingest.datasets.recording import STEP
+from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
 from tests.stages import layout_writers as writers
 from tests.stages.fit_clip import BODY_FILE
@@ -197,7 +197,7 @@ def test_zju_as_one_video(tmp_path, shown, bend):
 def test_zju_as_gauhuman_reads_it(tmp_path, shown):
     folder = writers.zju(tmp_path / "my_377", shown, np.zeros(5))
     train = [5 * row for row in range(COUNT)]
-    test = [STEP, 2 * STEP]
+    test = [SHOT_STEP, 2 * SHOT_STEP]
     folder_of_points = points(tmp_path, shown.still, train)
     for place, number in enumerate(test, start=1):
         writers.keypoint_files(Path(folder_of_points), shown.rig[place].keypoints, [number])
@@ -213,7 +213,7 @@ def test_zju_as_gauhuman_reads_it(tmp_path, shown):
     translation = np.stack([takes[f][0].translation[takes[f][1]] for f in train + test])
     check_cameras(output, rotation, translation, shown.still.matrix, train + test)
     # The held-out cameras see the same body at the same moment.
-    check_body(output, shown, {0: 0, 25: 5, STEP: 0, 2 * STEP: 0}, 0.3)
+    check_body(output, shown, {0: 0, 25: 5, SHOT_STEP: 0, 2 * SHOT_STEP: 0}, 0.3)
 
 
 def test_wildavatar(tmp_path, shown):
@@ -333,17 +333,21 @@ def test_xhumans(tmp_path, shown):
 def test_persona(tmp_path, shown):
     output = ingest(tmp_path, writers.persona(tmp_path / "someone", shown))
     split = read_split(output / "split.json")
-    assert split.train == (0, 1, 2, 3) and split.test == (STEP, STEP + 1)
+    assert split.train == (0, 1, 2, 3) and split.test == (SHOT_STEP, SHOT_STEP + 1)
     expect(
         output,
-        {**{n: (shown.still, n) for n in range(4)}, STEP: (shown.still, 4), STEP + 1: (shown.still, 5)},
+        {
+            **{n: (shown.still, n) for n in range(4)},
+            SHOT_STEP: (shown.still, 4),
+            SHOT_STEP + 1: (shown.still, 5),
+        },
     )
-    check_body(output, shown, {0: 0, 3: 3, STEP: 4, STEP + 1: 5}, 0.3)
+    check_body(output, shown, {0: 0, 3: 3, SHOT_STEP: 4, SHOT_STEP + 1: 5}, 0.3)
 
 
 def test_pose2sim(tmp_path, shown):
     folder = writers.pose2sim(tmp_path / "rig", shown)
-    numbers = [n for n in range(COUNT)] + [place * STEP + n for place in (1, 2) for n in range(FEW)]
+    numbers = [n for n in range(COUNT)] + [place * SHOT_STEP + n for place in (1, 2) for n in range(FEW)]
     at = [shown.still] * COUNT + [take for take in shown.rig[1:] for _ in range(FEW)]
     rows = list(range(COUNT)) + 2 * list(range(FEW))
     masks = tmp_path / "masks"

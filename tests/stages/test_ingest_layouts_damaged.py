@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UserError
-from stages.ingest.datasets import LAYOUTS, open_recording
-from stages.ingest.datasets.registry import layout_of
+from stages.ingest.datasets import LAYOUTS, layout_of, open_recording
 from stages.ingest.settings import IngestSettings
 from tests.stages import layout_writers as writers
 from tests.stages.layout_footage import COUNT, footage

@@ -9,23 +9,23 @@ import pytest
 
 from pipeline.clip.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
 from pipeline.detection.mediapipe import estimator_scale
-from pipeline.detection.wholebody import Landmarks, detour, score_faces, score_hands, to_keypoints
+from pipeline.detection.wholebody import PixelLandmarks, detour, score_faces, score_hands, to_keypoints
 from pipeline.errors import UserError
 from stages.ingest import people
-from stages.ingest.background import learn, take_out
-from stages.ingest.edges import follow_edges
+from stages.ingest.background import learn_background, subtract_background
+from stages.ingest.mask_edges import follow_edges
+from stages.ingest.mask_smoothing import smooth_masks
 from stages.ingest.masks import (
     fill_holes,
     fuse,
     main_component,
     overlap,
-    read_raw,
+    read_segmentations,
     selfie_share,
-    write_raw,
+    write_segmentations,
 )
 from stages.ingest.people import Person
 from stages.ingest.split import split_frames
-from stages.ingest.steady import steady
 from tests.stages.ingest_clips import walking_blob
 
 # People.
@@ -37,7 +37,7 @@ def person(x: float, size: float, y: float = 50.0) -> Person:
 
 def test_the_larger_person_is_kept_and_the_other_counted() -> None:
     looks = [(frame, [person(60 + frame, 20), person(150 - frame, 40)]) for frame in range(0, 30, 5)]
-    found = people.survey(looks, 200, 100)
+    found = people.track_people(looks, 200, 100)
     assert found.count == 2 and found.subject is not None
     assert {one.radius for one in found.subject.people.values()} == {1.8 * 40}
     assert len(found.others) == 1
@@ -45,43 +45,43 @@ def test_the_larger_person_is_kept_and_the_other_counted() -> None:
 
 def test_of_equal_people_the_central_one_is_kept() -> None:
     looks = [(frame, [person(10, 30), person(105, 30)]) for frame in range(5)]
-    found = people.survey(looks, 200, 100)
+    found = people.track_people(looks, 200, 100)
     assert found.subject is not None and found.subject.at(0).hips[0] == 105
 
 
 def test_a_false_alarm_does_not_count() -> None:
     looks = [(frame, [person(100, 30), *([person(20, 10)] if frame == 4 else [])]) for frame in range(20)]
-    assert people.survey(looks, 200, 100).count == 1
+    assert people.track_people(looks, 200, 100).count == 1
 
 
 def test_a_person_lost_and_found_elsewhere_is_not_another() -> None:
     looks = [(frame, [person(30 if frame < 10 else 160, 30)]) for frame in range(20)]
-    found = people.survey(looks, 200, 100)
+    found = people.track_people(looks, 200, 100)
     assert found.count == 1 and found.others == ()
-    assert people.territory(5, found, 200, 100) is None
+    assert people.subject_region(5, found, 200, 100) is None
 
 
 def test_nobody() -> None:
-    assert people.survey([(0, []), (1, [])], 200, 100) == people.Survey(None, (), 0)
+    assert people.track_people([(0, []), (1, [])], 200, 100) == people.ClipPeople(None, (), 0)
 
 
 def test_tracks_follow_people_who_pass_each_other_slowly() -> None:
     looks = [(frame, [person(40 + 4 * frame, 30), person(160 - 4 * frame, 12, y=20)]) for frame in range(30)]
-    sizes = [{one.radius for one in track.people.values()} for track in people.link(looks)]
+    sizes = [{one.radius for one in track.people.values()} for track in people.link_detections(looks)]
     assert sorted(sizes, key=min) == [{1.8 * 12}, {1.8 * 30}]
 
 
 def test_the_picture_is_shared_out_and_the_rest_painted_over() -> None:
     looks = [(frame, [person(60, 30), person(160, 20)]) for frame in range(5)]
-    found = people.survey(looks, 200, 100)
-    own = people.territory(2, found, 200, 100)
+    found = people.track_people(looks, 200, 100)
+    own = people.subject_region(2, found, 200, 100)
     assert own is not None and own.shape == (100, 200)
     assert own[60, 60] and not own[60, 160]
     image = np.zeros((100, 200, 3), np.uint8)
     image[:, 150:] = 200
-    shown = people.spotlight(image, own)
+    shown = people.hide_others(image, own)
     assert (shown[60, 160] == 50).all() and (shown[60, 60] == 0).all()
-    assert people.spotlight(image, None) is image
+    assert people.hide_others(image, None) is image
 
 
 # Scores.
@@ -136,7 +136,7 @@ def test_tiny_hands_are_not_trusted_unless_enlarged() -> None:
     assert (score_hands(hands, wrists, 6.0) > 0.9).all()
 
 
-def landmarks_at(shift: float = 0.0) -> Landmarks:
+def landmarks_at(shift: float = 0.0) -> PixelLandmarks:
     pose = np.zeros((33, 4), np.float32)
     pose[:, 0], pose[:, 1], pose[:, 3] = 40 + np.arange(33), 60, 0.8
     face = np.ones((478, 4), np.float32)
@@ -148,7 +148,7 @@ def landmarks_at(shift: float = 0.0) -> Landmarks:
     face[:, 0] += shift
     hands = np.zeros((2, 21, 4), np.float32)
     hands[0] = hand_at(pose[15, 0], pose[15, 1], 20)
-    return Landmarks(pose, np.zeros((33, 4), np.float32), face, hands)
+    return PixelLandmarks(pose, np.zeros((33, 4), np.float32), face, hands)
 
 
 def test_landmarks_become_the_133_points() -> None:
@@ -207,8 +207,8 @@ def test_detour_measures_jumps_not_motion() -> None:
 def test_raw_masks_round_trip(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     body, selfie = rng.uniform(0, 1, (2, 20, 30)).astype(np.float32)
-    write_raw(tmp_path, 3, body, selfie)
-    for written, read in zip((body, selfie), read_raw(tmp_path, 3), strict=True):
+    write_segmentations(tmp_path, 3, body, selfie)
+    for written, read in zip((body, selfie), read_segmentations(tmp_path, 3), strict=True):
         assert np.abs(written - read).max() <= 0.5 / 255 + 1e-6
 
 
@@ -277,12 +277,12 @@ def test_the_edge_stays_where_the_colours_tell_nothing() -> None:
 def test_a_still_background_is_taken_out_and_the_person_is_not() -> None:
     frames, masks = walking_blob(16)
     truth = [mask.astype(np.float32) / 255 for mask in masks]
-    background = learn(zip(frames, truth, strict=True))
+    background = learn_background(zip(frames, truth, strict=True))
     assert background is not None
     sloppy = truth[8].copy()
     sloppy[20:40, 5:20] = 0.7  # a piece of wall that the segmentation took in
     assert truth[8][20:40, 5:20].max() == 0
-    cleaned = take_out(sloppy, frames[8], background.model())
+    cleaned = subtract_background(sloppy, frames[8], background)
     assert cleaned[22:38, 7:18].max() < 0.3
     assert cleaned[truth[8] > 0].min() > 0.9
 
@@ -291,21 +291,21 @@ def test_a_moving_background_is_left_alone() -> None:
     rng = np.random.default_rng(0)
     frames = [rng.integers(0, 256, (40, 50, 3), dtype=np.uint8) for _ in range(12)]
     nowhere = [np.zeros((40, 50), np.float32)] * 12
-    background = learn(zip(frames, nowhere, strict=True))
-    assert background is not None and background.model()[2].max() == 0
+    background = learn_background(zip(frames, nowhere, strict=True))
+    assert background is not None and background.confidence.max() == 0
     mask = rng.uniform(0.1, 0.9, (40, 50)).astype(np.float32)
-    np.testing.assert_allclose(take_out(mask, frames[0], background.model()), mask, atol=1e-5)
+    np.testing.assert_allclose(subtract_background(mask, frames[0], background), mask, atol=1e-5)
 
 
 def test_no_frames_no_background() -> None:
-    assert learn([]) is None
+    assert learn_background([]) is None
 
 
 @pytest.mark.parametrize(("count", "reach"), [(1, 2), (3, 2), (9, 2), (9, 0)])
 def test_one_mask_a_frame_comes_out(count: int, reach: int) -> None:
     frames, masks = walking_blob(count)
     pairs = [(frame, mask / np.float32(255)) for frame, mask in zip(frames, masks, strict=True)]
-    out = list(steady(iter(pairs), reach))
+    out = list(smooth_masks(iter(pairs), reach))
     assert len(out) == count
     for (_, mask), steadied in zip(pairs, out, strict=True):
         assert overlap(mask, steadied) > 0.9
@@ -323,7 +323,7 @@ def test_flicker_is_averaged_away() -> None:
     def flicker(sequence: list[np.ndarray]) -> float:
         return float(np.abs(np.diff(np.stack(sequence), axis=0)).mean())
 
-    assert flicker(list(steady(iter(pairs), 2))) < 0.5 * flicker([mask for _, mask in pairs])
+    assert flicker(list(smooth_masks(iter(pairs), 2))) < 0.5 * flicker([mask for _, mask in pairs])
 
 
 # Split, sizes, settings.

@@ -13,7 +13,7 @@ from pipeline.clip.records import read_cameras, read_footage, read_split
 from pipeline.config.request import parse_request
 from pipeline.pose_files import RECORD
 from pipeline.run.job import open_job
-from stages.ingest.datasets.recording import STEP
+from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
 from tests.stages.ingest_clips import make_context
 
@@ -53,17 +53,17 @@ def test_four_calibrated_cameras_see_one_person(tmp_path, assets_folder):
     output = context.output
     split = read_split(output / "split.json")
     assert split.train == FRAMES
-    assert split.test == tuple(camera * STEP + frame for camera in (1, 2, 3) for frame in FRAMES)
+    assert split.test == tuple(camera * SHOT_STEP + frame for camera in (1, 2, 3) for frame in FRAMES)
     assert read_footage(output / "footage.json").camera["source"] == "Qualisys"
     cameras = read_cameras(output / "cameras.parquet", torch.float64)
     keypoints = read_keypoints(output / "keypoints.parquet")
     projections = [
         (c.intrinsics @ torch.cat([c.rotation, c.translation[:, None]], dim=1)).numpy()
-        for c in (cameras[camera * STEP] for camera in range(4))
+        for c in (cameras[camera * SHOT_STEP] for camera in range(4))
     ]
     points, errors = [], []
     for frame in FRAMES:
-        rows = [keypoints.index(camera * STEP + frame) for camera in range(4)]
+        rows = [keypoints.index(camera * SHOT_STEP + frame) for camera in range(4)]
         seen = keypoints.pose_image[rows][:, list(JOINTS), :2].astype(np.float64)
         points.append([triangulate(projections, seen[:, joint]) for joint in range(len(JOINTS))])
         for projection, pixels in zip(projections, seen, strict=True):

@@ -16,13 +16,12 @@ from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, read_split
 from stages.ingest.mannequin import FRAMINGS, MannequinSpec
-from stages.ingest.mannequin.footage import Filming, film_view, make_mannequin
+from stages.ingest.mannequin.footage import Filming, film_view, make_mannequin, run_mannequin
 from stages.ingest.mannequin.framing import unseen_camera
 from stages.ingest.mannequin.motion import make_motion
 from stages.ingest.mannequin.person import make_identity
-from stages.ingest.mannequin.publish import run_mannequin
-from stages.ingest.mannequin.spec import spec_of
-from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, read_truth, seen_vertices, states
+from stages.ingest.mannequin.spec import mannequin_spec
+from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, point_states, read_truth, seen_vertices
 
 BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
 SIZE, FRAMES = 96, 5
@@ -228,9 +227,9 @@ def test_framings_show_what_they_say(clips):
 
 
 def test_a_turning_body_hides_its_points(clips):
-    states = clips["full"].truth.keypoint_state
-    assert (states[0, BODY] == SEEN).mean() > 0.8
-    assert (states[HALF_WAY, :5] == HIDDEN).sum() >= 3  # nose and eyes from behind
+    point_states = clips["full"].truth.keypoint_state
+    assert (point_states[0, BODY] == SEEN).mean() > 0.8
+    assert (point_states[HALF_WAY, :5] == HIDDEN).sum() >= 3  # nose and eyes from behind
 
 
 def test_pictures_have_texture_and_the_background_none_of_it(clips):
@@ -277,7 +276,9 @@ def test_what_ingest_publishes_is_published(tmp_path, body):
         mannequin="head", mannequin_frames=4, mannequin_size=48,
         mannequin_views=("left",), mannequin_view_stride=2, test_fraction=0.25, test_frames=0,
     )  # fmt: skip
-    assert spec_of(settings) == MannequinSpec("head", frames=4, size=48, views=("left",), view_stride=2)
+    assert mannequin_spec(settings) == MannequinSpec(
+        "head", frames=4, size=48, views=("left",), view_stride=2
+    )
     outputs = []
     for name in ("a", "b"):
         output = tmp_path / name
@@ -317,10 +318,10 @@ def test_a_limb_hides_its_own_joints_less_than_others_do(body, landmarks):
     filming = Filming(spec, body, landmarks)
     picture, camera, places = next(filming.pictures()), filming.scene.shot.camera, filming.places
     elbow = joint_index("left_elbow")
-    assert states(camera, picture, places, 0)[elbow] == SEEN
+    assert point_states(camera, picture, places, 0)[elbow] == SEEN
     x, y = (project(camera, places.world[0, elbow]) * 2).long().tolist()
     for limb, nearer, expected in ((1, 0.15, SEEN), (1, 0.4, HIDDEN), (2, 0.15, HIDDEN), (0, 0.15, HIDDEN)):
         depth, limbs = picture.depth.copy(), picture.limb.copy()
         depth[y, x], limbs[y, x] = -places.world[0, elbow, 2] - nearer, limb
         changed = dataclasses.replace(picture, depth=depth, limb=limbs)
-        assert states(camera, changed, places, 0)[elbow] == expected
+        assert point_states(camera, changed, places, 0)[elbow] == expected

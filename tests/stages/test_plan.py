@@ -16,7 +16,7 @@ from pipeline.config.settings import command_line_layer, resolve
 from pipeline.errors import UserError
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
-from stages.ingest.cameras.motion import MOVING
+from stages.ingest.cameras.background_motion import MOVING
 from stages.plan import decide, measure
 from stages.plan.run import run
 from stages.plan.settings import PlanSettings

@@ -31,7 +31,7 @@ from pipeline.untrusted import (
     read_pickle,
     read_torch,
 )
-from stages.ingest.detections import read_foreign_mask
+from stages.ingest.external_detections import read_given_mask
 from stages.ingest.video import read_picture
 
 REMEDY = "get it again"
@@ -238,7 +238,7 @@ def test_a_png_of_a_hundred_gigapixels_is_refused_by_its_header(tmp_path):
     for call in (
         lambda: check_picture(path, REMEDY),
         lambda: read_picture(path),
-        lambda: read_foreign_mask(path, 64, 64),
+        lambda: read_given_mask(path, 64, 64),
     ):
         peak, said = peak_while(call)
         assert peak < 32 << 20 and "00001.png" in said and "pixels" in said

@@ -1,4 +1,4 @@
-"""The cameras of a clip: measured, read or found, then in metres and upright."""
+"""The choice of a clip's cameras: read, found or a static pinhole; in metres, in an upright world."""
 
 from __future__ import annotations
 
@@ -15,17 +15,30 @@ from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
-from stages.ingest.cameras.apply import select
-from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
-from stages.ingest.cameras.gaps import fill_gaps
-from stages.ingest.cameras.lens import LEFT_ALONE, distortion, pinhole_of, stored_view
-from stages.ingest.cameras.motion import measure_motion
-from stages.ingest.cameras.numbering import frames_by_name
-from stages.ingest.cameras.scale import Scale, metric_scale, person_places, posed_places
-from stages.ingest.cameras.structure import mapped_frames, structure_from_motion
-from stages.ingest.cameras.turning import MOSTLY_TURNS, ONLY_TURNS, chain_turns, unexplained_by_turns
-from stages.ingest.cameras.world import settle
-from stages.ingest.detect import Detected
+from stages.ingest.cameras.background_motion import measure_motion
+from stages.ingest.cameras.calibration import (
+    EVERY_FRAME,
+    CalibratedCamera,
+    Calibration,
+    frames_by_name,
+    pinhole_lens,
+)
+from stages.ingest.cameras.distortion import (
+    LEFT_ALONE,
+    distortion_pixels,
+    for_stored_frames,
+    without_distortion,
+)
+from stages.ingest.cameras.extrinsics import interpolate_gaps, to_upright_world
+from stages.ingest.cameras.rotation_only import (
+    MOSTLY_ROTATION,
+    ROTATION_ONLY,
+    chain_rotations,
+    unexplained_by_rotation,
+)
+from stages.ingest.cameras.scale import Scale, metric_scale, person_positions, posed_positions
+from stages.ingest.cameras.structure_from_motion import mapped_frames, structure_from_motion
+from stages.ingest.detect import DetectedClip
 from stages.ingest.video import Clip
 
 if TYPE_CHECKING:
@@ -35,7 +48,7 @@ GAP_SECONDS = 0.5  # over which a camera is interpolated between two that are kn
 
 
 @dataclasses.dataclass(frozen=True)
-class Chosen:
+class ClipCameras:
     """The cameras of a clip.
 
     Attributes:
@@ -52,29 +65,29 @@ class Chosen:
 def choose_cameras(
     context: Context,
     clip: Clip,
-    detected: Detected,
+    detected: DetectedClip,
     given: Calibration | None,
     poses: InitialPoses | None = None,
-) -> Chosen:
+) -> ClipCameras:
     """The cameras of the kept frames.
 
     Args:
         context: the stage's; ``frames`` and ``masks`` are written by now.
         clip: the footage.
-        detected: what was seen in it.
+        detected: the kept frames.
         given: the user's or the dataset's calibration, if there is one.
-        poses: what the dataset says of the body, which then tells the scale.
+        poses: the dataset's, which then tell the scale.
 
     Raises:
         UserError: the calibration is not of this footage.
     """
     settings = context.settings
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     if given is not None:
         return _from_calibration(context, clip, detected, given, poses)
     record: dict[str, Any] = {"source": "pinhole", "displacement": None, "metres_per_unit": None}
     if settings.cameras == "auto":
-        motion = measure_motion(context.output, frames, kept_rate(context, clip))
+        motion = measure_motion(context.output, frames, kept_fps(context, clip))
         context.log(str(motion))
         record["displacement"] = round(motion.displacement, 6) if motion.pairs else None
     if settings.cameras == "sfm" or (settings.cameras == "auto" and motion.moving):
@@ -86,53 +99,49 @@ def choose_cameras(
         context.log("cameras: none could be found, so a static pinhole takes their place")
     focal = settings.focal * max(detected.width, detected.height)
     camera = facing_camera(detected.width, detected.height, focal)
-    return Chosen(dict.fromkeys(frames, camera), {}, record)
+    return ClipCameras(dict.fromkeys(frames, camera), {}, record)
 
 
-def kept_rate(context: Context, clip: Clip) -> float:
-    """Kept frames a second: of a clip of which every ``ingest.stride``-th frame is read."""
+def kept_fps(context: Context, clip: Clip) -> float:
+    """Kept frames a second where every ``ingest.stride``-th frame of the clip is read."""
     return (clip.fps or 25.0) / context.settings.stride
 
 
-def _find(context: Context, clip: Clip, detected: Detected) -> Chosen | None:
+def _find(context: Context, clip: Clip, detected: DetectedClip) -> ClipCameras | None:
     """Cameras from the background's motion; None where it gives none."""
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     width, height = detected.width, detected.height
     focal = context.settings.focal * max(width, height)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    share = unexplained_by_turns(context.output, frames, kept_rate(context, clip), matrix)
-    if share > ONLY_TURNS:
+    share = unexplained_by_rotation(context.output, frames, kept_fps(context, clip), matrix)
+    if share > ROTATION_ONLY:
         centre = (width / 2, height / 2)
         found = structure_from_motion(context.output, context.work / "sfm", frames, focal, centre)
         if not isinstance(found, str):
-            return _from_model(context, clip, detected, found, frames)
+            return _from_model(context, clip, detected, found)
         context.log(f"cameras: structure from motion failed: {found}")
-    rotations = chain_turns(context.output, frames, matrix) if share <= MOSTLY_TURNS else None
+    rotations = chain_rotations(context.output, frames, matrix) if share <= MOSTLY_ROTATION else None
     if rotations is None:
         context.log(
             f"cameras: rotations leave {share:.0%} of the background's motion unexplained, or lose it"
         )
         return None
     context.log(f"cameras: rotations only, which leave {share:.1%} of the background's motion unexplained")
-    turned = settle(np.stack(rotations), np.zeros((len(frames), 3)))
     lens = pinhole_lens(width, height, (focal, focal), (width / 2, height / 2))
-    views = {
-        frame: CalibratedCamera(lens, turned[0][row], turned[1][row]) for row, frame in enumerate(frames)
-    }
-    return Chosen(_cameras(views), {}, {"source": "rotation", "unexplained": round(share, 6)})
+    views = {f: CalibratedCamera(lens, r, np.zeros(3)) for f, r in zip(frames, rotations, strict=True)}
+    return ClipCameras(_cameras(_settled(views)), {}, {"source": "rotation", "unexplained": round(share, 6)})
 
 
-def _from_model(
-    context: Context, clip: Clip, detected: Detected, model: Calibration, frames: list[int]
-) -> Chosen:
-    """The frames of a model of this clip, those between them, in metres."""
+def _from_model(context: Context, clip: Clip, detected: DetectedClip, model: Calibration) -> ClipCameras:
+    """The cameras of a model of this clip and of the frames between them, in metres."""
+    frames = detected.keypoints.frames.tolist()
     known = {int(name[:-4]): view for name, view in model.views.items()}
     lens = next(iter(known.values())).lens
     mapped = mapped_frames(frames)
     longest = max(GAP_SECONDS * (clip.fps or 25.0), 3 * float(np.diff(mapped).max(initial=1)))
-    poses = fill_gaps({f: (v.rotation, v.translation) for f, v in known.items()}, frames, int(longest))
+    poses = interpolate_gaps({f: (v.rotation, v.translation) for f, v in known.items()}, frames, int(longest))
     views = {frame: CalibratedCamera(lens, *pose) for frame, pose in poses.items()}
-    scaled, scale = _metric(context, detected.keypoints, views, kept_rate(context, clip), model)
+    scaled, scale = _metric(context, detected.keypoints, views, kept_fps(context, clip), model)
     context.log(
         f"cameras: structure from motion placed {len(known)} of {len(mapped)} frames, focal length "
         f"{lens.mean_focal_length():.0f} pixels; {scale.note}"
@@ -143,16 +152,16 @@ def _from_model(
         "placed": len(known),
         "interpolated": len(views) - len(set(views) & set(known)),
     }
-    return Chosen(_cameras(_settled(scaled)), {}, record)
+    return ClipCameras(_cameras(_settled(scaled)), {}, record)
 
 
 def _from_calibration(
-    context: Context, clip: Clip, detected: Detected, given: Calibration, poses: InitialPoses | None
-) -> Chosen:
+    context: Context, clip: Clip, detected: DetectedClip, given: Calibration, poses: InitialPoses | None
+) -> ClipCameras:
     """The cameras that the user or the dataset gives."""
-    frames = [int(frame) for frame in detected.keypoints.frames]
+    frames = detected.keypoints.frames.tolist()
     stored = {
-        name: stored_view(view, clip, detected.width, detected.height, given.path)
+        name: for_stored_frames(view, clip, detected.width, detected.height, given.path)
         for name, view in given.views.items()
     }
     first = 0
@@ -169,9 +178,12 @@ def _from_calibration(
         )
     scale = Scale(1.0, "metres as given")
     if not given.metric:
-        rate = kept_rate(context, clip)
+        rate = kept_fps(context, clip)
         views, scale = _metric(context, detected.keypoints, views, rate, given, poses)
-    bent = {number: distortion(lens) for number, lens in {id(v.lens): v.lens for v in views.values()}.items()}
+    bent = {
+        number: distortion_pixels(lens)
+        for number, lens in {id(v.lens): v.lens for v in views.values()}.items()
+    }
     lenses = {f: v.lens for f, v in views.items() if bent[id(v.lens)] > LEFT_ALONE}
     context.log(
         f"cameras: {given.kind}, {given.path.name}: {len(views)} of {len(frames)} frames"
@@ -186,7 +198,7 @@ def _from_calibration(
         "undistorted": bool(lenses),
         "displacement": None,
     }
-    return Chosen(_cameras(views), lenses, record)
+    return ClipCameras(_cameras(views), lenses, record)
 
 
 def _distorted(pixels: float, taken_out: bool) -> str:
@@ -205,44 +217,40 @@ def _metric(
     poses: InitialPoses | None = None,
 ) -> tuple[dict[int, CalibratedCamera], Scale]:
     """The views with translations in metres."""
-    scale = Scale(context.settings.camera_scale, f"{context.settings.camera_scale:g} metres a unit, as set")
-    if not scale.metres:
+    given = context.settings.camera_scale
+    scale = Scale(given, f"{given:g} metres a unit, as set")
+    if not given:
         rows = np.flatnonzero(np.isin(keypoints.frames, list(views)))
         chosen = [views[int(frame)] for frame in keypoints.frames[rows]]
         lenses = [view.lens for view in chosen]
         focal = np.array([[lens.focal_length_x, lens.focal_length_y] for lens in lenses])
         centre = np.array([[lens.principal_point_x, lens.principal_point_y] for lens in lenses])
-        placed, places = posed_places(keypoints.frames[rows], poses)
+        placed, places = posed_positions(keypoints.frames[rows], poses)
         if not len(placed):
-            placed, places = person_places(select(keypoints, rows), focal, centre)
-        rotations, translations = (
-            np.stack([getattr(v, n) for v in chosen]) for n in ("rotation", "translation")
-        )
-        scale = metric_scale(rotations[placed], translations[placed], places, fps, model.depth)
-    return {
-        frame: dataclasses.replace(view, translation=view.translation * scale.metres)
-        for frame, view in views.items()
-    }, scale
+            placed, places = person_positions(keypoints.select(rows), focal, centre)
+        rotations = np.stack([view.rotation for view in chosen])[placed]
+        translations = np.stack([view.translation for view in chosen])[placed]
+        scale = metric_scale(rotations, translations, places, fps, model.depth)
+    metres = scale.metres
+    scaled = {f: dataclasses.replace(v, translation=v.translation * metres) for f, v in views.items()}
+    return scaled, scale
 
 
 def _settled(views: Mapping[int, CalibratedCamera]) -> dict[int, CalibratedCamera]:
-    """The same cameras in our world: see :mod:`.world`."""
+    """The same cameras in an upright world."""
     order = sorted(views)
-    rotations, translations = settle(
-        np.stack([views[frame].rotation for frame in order]),
-        np.stack([views[frame].translation for frame in order]),
+    parts = (
+        np.stack([getattr(views[frame], name) for frame in order]) for name in ("rotation", "translation")
     )
-    return {
-        frame: dataclasses.replace(views[frame], rotation=rotations[row], translation=translations[row])
-        for row, frame in enumerate(order)
-    }
+    poses = zip(order, *to_upright_world(*parts), strict=True)
+    return {frame: dataclasses.replace(views[frame], rotation=r, translation=t) for frame, r, t in poses}
 
 
 def _cameras(views: Mapping[int, CalibratedCamera]) -> dict[int, Camera]:
     """The pinholes of views of the stored frames."""
     cameras = {}
     for frame, view in sorted(views.items()):
-        lens = pinhole_of(view.lens)
+        lens = without_distortion(view.lens)
         arrays = (lens.calibration_matrix(), view.rotation, view.translation)
         tensors = (torch.tensor(np.asarray(array), dtype=torch.float64) for array in arrays)
         cameras[frame] = Camera(lens.width, lens.height, *tensors)

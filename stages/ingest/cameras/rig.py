@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
+from pipeline.untrusted import bounded_bytes
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
 
 _Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # coordinates there -> coordinates here
@@ -23,21 +24,48 @@ _FIXED_POINT = 64.0  # Qualisys writes pixels in 64ths
 _MILLIMETRES = 1e-3
 
 
-def read_qualisys(path: Path, name: str) -> Calibration:
-    """One camera of a Qualisys calibration (XML).
+def read_rig(path: Path, name: str) -> Calibration:
+    """One camera of a rig's calibration, Pose2Sim's where the file is TOML, else Qualisys'.
+
+    Args:
+        path: the file.
+        name: which camera; may be empty where there is one only.
+
+    Raises:
+        UserError: not such a file, damaged, or no camera of that name.
+    """
+    cameras = _read_cameras(path)
+    camera = cameras[_choose(path, name, list(cameras))]
+    return _pose2sim(path, camera) if path.suffix == ".toml" else _qualisys(path, camera)
+
+
+def camera_names(path: Path) -> list[str]:
+    """The cameras of a rig's calibration, in its order; UserError where it is malformed."""
+    return list(_read_cameras(path))
+
+
+def _read_cameras(path: Path) -> dict[str, Any]:
+    """Name -> TOML table or XML element."""
+    content = bounded_bytes(path, 16 << 20, "calibrate again")
+    try:
+        if path.suffix != ".toml":
+            return {
+                one.get("serial", ""): one for one in ElementTree.fromstring(content).findall(".//camera")
+            }
+        tables = tomllib.loads(content.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, ElementTree.ParseError, ValueError) as error:
+        kind = "Pose2Sim" if path.suffix == ".toml" else "Qualisys"
+        raise UserError(f"{path} is no {kind} calibration ({error}): export it again") from None
+    known = {key: one for key, one in tables.items() if isinstance(one, dict) and "matrix" in one}
+    return {str(one.get("name", key)): one for key, one in known.items()}
+
+
+def _qualisys(path: Path, camera: ElementTree.Element) -> Calibration:
+    """A camera of Qualisys' XML.
 
     The rotation is camera-to-world by columns of axes that look along -Z with Y up; the translation is the
     camera's place in millimetres. Focal lengths and centre are in 1/64 pixel; distortion is OpenCV's.
-
-    Raises:
-        UserError: not such a file, or no camera of that name.
     """
-    try:
-        cameras = ElementTree.parse(path).getroot().findall(".//camera")
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        raise UserError(f"{path} is no Qualisys calibration ({error}): export it again") from None
-    by_name = {camera.get("serial", ""): camera for camera in cameras}
-    camera = by_name[_choose(path, name, list(by_name))]
     try:
         place, lens, frame = (_numbers(camera, part) for part in ("transform", "intrinsic", "fov_video"))
         axes = np.array([[place[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)])
@@ -56,22 +84,8 @@ def read_qualisys(path: Path, name: str) -> Calibration:
     return _standing(path, "Qualisys", _lens(size, focal, middle, bend), rotation, -rotation @ centre)
 
 
-def read_toml_rig(path: Path, name: str) -> Calibration:
-    """One camera of a Pose2Sim calibration (TOML): size, matrix, distortions, rotation vector, metres.
-
-    Raises:
-        UserError: not such a file, or no camera of that name.
-    """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path} is no readable calibration ({error}): export it again") from None
-    by_name = {
-        str(table.get("name", key)): table
-        for key, table in tables.items()
-        if isinstance(table, dict) and "matrix" in table
-    }
-    table = by_name[_choose(path, name, list(by_name))]
+def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
+    """A camera of Pose2Sim's TOML: size, matrix, distortions, rotation vector, metres."""
     try:
         matrix = np.array(table["matrix"], np.float64).reshape(3, 3)
         turn = np.array(table["rotation"], np.float64).reshape(3)

@@ -1,12 +1,11 @@
-"""How many metres one unit of a model without a scale is, from how the person moves.
+"""The metres of one unit of cameras without a scale, from the person's motion.
 
 In camera axes the person's place c_t is known in metres: the estimator's 3D landmarks have the size of a
-body, and their pixels say how far away it is. The cameras are known up to one factor s, so the person's
-place in the world is X_t = R_t^T (c_t - s t_t) = a_t - s b_t. A wrong s makes the camera's motion shake the
-person, so s is taken where the path is shortest, sum |X_(t+1) - X_t|^2, in closed form. Both a and b are
-smoothed first, by the same filter, which leaves s as it is and takes out the noise of the depths. A person
-who moves with the camera, as in a tracking shot, looks like a small s: bounds from the scene's depth keep
-the background behind the person.
+body, and their pixels give its distance. The cameras are known up to one factor s, so the person's place in
+the world is X_t = R_t^T (c_t - s t_t) = a_t - s b_t. A wrong s makes the camera's motion shake the person, so
+s minimises the path sum |X_(t+1) - X_t|^2, in closed form. a and b are smoothed first by the same filter,
+which keeps s and removes the noise of the depths. A person who moves with the camera looks like a small s:
+bounds from the scene's depth keep the background behind the person.
 """
 
 from __future__ import annotations
@@ -30,21 +29,16 @@ STILL = 1e-9  # squared motion of the cameras, in their unit, below which there 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Metres a unit, and what it rests on.
-
-    Attributes:
-        metres: s.
-        note: for the log.
-    """
+    """Metres a unit (s above), and a note for the log on what it rests on."""
 
     metres: float
     note: str
 
 
-def person_places(
+def person_positions(
     keypoints: Keypoints, focal: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the person is in each camera's axes, by weak perspective.
+    """The person's place in each camera's axes, by weak perspective.
 
     The centroid of trunk and head points (those seen in most frames) in ``pose_world`` metres, whose axes
     are the camera's, is fitted to the same points' pixels: depth = focal / (pixels a metre).
@@ -75,15 +69,10 @@ def person_places(
     return rows, np.concatenate([offset, depth[:, None]], axis=1)
 
 
-def posed_places(frames: np.ndarray, poses: InitialPoses | None) -> tuple[np.ndarray, np.ndarray]:
-    """Where poses that came with a dataset put the root joint in each camera's axes.
+def posed_positions(frames: np.ndarray, poses: InitialPoses | None) -> tuple[np.ndarray, np.ndarray]:
+    """The root joint's place in each camera's axes by poses that came with a dataset.
 
-    Args:
-        frames: [T], frame numbers.
-        poses: of some frames, or None.
-
-    Returns:
-        As ``person_places``; nothing where there are no poses, or they have no place.
+    Takes T frame numbers [T]; returns as :func:`person_positions`, and nothing where poses have no place.
     """
     if poses is None or poses.transl is None:
         return np.zeros(0, int), np.zeros((0, 3))

@@ -28,8 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
-import torch
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import UserError
@@ -42,9 +40,18 @@ from stages.ingest.cameras.calibration import (
     check_rotation,
     pinhole_lens,
 )
-from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
+from stages.ingest.datasets.recording import (
+    Recording,
+    Shot,
+    entry,
+    numbers,
+    pinhole_of_matrix,
+    read_array,
+    select_frames,
+)
+from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip
+from stages.ingest.video import Clip, folder_clip, numbered_files
 
 _REMEDY = "unpack the INSTA subject again"
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -59,21 +66,23 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read an actor's folder; UserError where a file of it is malformed."""
-    pictures = numbered(source / "images")
+    pictures = numbered_files(source / "images")
     clip = folder_clip(source / "images", pictures, 25.0)
-    tracked = only(numbered(source / "checkpoint", (".frame",)), pictures) or {}
+    tracked = select_frames(numbered_files(source / "checkpoint", (".frame",)), pictures) or {}
     heads = {frame: _head(path) for frame, path in tracked.items()}
     path = source / "transforms.json"
     if path.is_file():
         views = _views(source, parse_json(path, _REMEDY), path, clip)
         calibration = Calibration(path, "INSTA", views, metric=True, upright=False)
     elif heads:
-        lens = _lens(next(iter(heads.values()))["K"], clip, source / "checkpoint")
+        lens = pinhole_of_matrix(next(iter(heads.values()))["K"], clip, source / "checkpoint", _REMEDY)
         still = CalibratedCamera(lens, np.eye(3), np.zeros(3))
         calibration = Calibration(path, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
     else:
         raise UserError(f"{source} has neither transforms.json nor checkpoint/*.frame: {_REMEDY}")
-    masks = only(numbered(source / "alpha"), pictures) or (pictures if _has_alpha(pictures) else None)
+    masks = select_frames(numbered_files(source / "alpha"), pictures) or (
+        pictures if _has_alpha(pictures) else None
+    )
     shot = Shot(clip, calibration, None, masks, "white", _poses(heads))
     return Recording("insta", (shot,), _listed(source, "train"), _listed(source, "test"))
 
@@ -83,12 +92,12 @@ def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, Calibr
     views = {}
     for number, frame in _entries(source, table, path).items():
         where = f"{path}, frame {number}"
-        matrix = numbers(entry(frame, "transform_matrix", path, _REMEDY), (4, 4), where, _REMEDY)
+        matrix = read_array(frame, "transform_matrix", (4, 4), where, _REMEDY)
         rotation = (matrix[:3, :3] @ _FLIP).T
         check_rotation(rotation, where)
         own = {**table, **frame}
         size = [float(own.get(name, side)) for name, side in (("w", clip.width), ("h", clip.height))]
-        focal = [numbers(entry(own, key, path, _REMEDY), (), where, _REMEDY) for key in ("fl_x", "fl_y")]
+        focal = [read_array(own, key, (), where, _REMEDY) for key in ("fl_x", "fl_y")]
         centre = [
             numbers(own.get(k, s / 2), (), where, _REMEDY) for k, s in zip(("cx", "cy"), size, strict=True)
         ]
@@ -137,12 +146,10 @@ def _head(path: Path) -> dict[str, np.ndarray]:
     """Jaw and eyes as rotation vectors [3, 3], expression, and the head in the camera."""
     value = read_torch(path, _REMEDY, _FRAME_BYTES)
     flame, camera = entry(value, "flame", path, _REMEDY), entry(value, "opencv", path, _REMEDY)
-    found = {
-        key: numbers(entry(camera, key, path, _REMEDY), shape, f"{path}, opencv {key}", _REMEDY)
-        for key, shape in (("R", (3, 3)), ("t", (3,)), ("K", (3, 3)))
-    }
+    shapes = (("R", (3, 3)), ("t", (3,)), ("K", (3, 3)))
+    found = {key: read_array(camera, key, shape, path, _REMEDY) for key, shape in shapes}
     check_rotation(found["R"], str(path))
-    found["exp"] = numbers(entry(flame, "exp", path, _REMEDY), (-1,), f"{path}, exp", _REMEDY)
+    found["exp"] = read_array(flame, "exp", (-1,), path, _REMEDY)
     turns = [_rotation_vectors(flame, key, count, path) for key, count in (("jaw", 1), ("eyes", 2))]
     return {**found, "turns": np.concatenate(turns)}
 
@@ -151,7 +158,7 @@ def _rotation_vectors(flame: Any, key: str, count: int, path: Path) -> np.ndarra
     """[count, 3]; zero where the file says nothing."""
     if key not in flame:
         return np.zeros((count, 3))
-    flat = numbers(flame[key], (-1,), f"{path}, {key}", _REMEDY)
+    flat = read_array(flame, key, (-1,), path, _REMEDY)
     if len(flat) == 3 * count:
         return flat.reshape(count, 3)
     rows = numbers(flat, (count, 2, 3), f"{path}, {key}", _REMEDY)
@@ -169,18 +176,5 @@ def _poses(heads: dict[int, dict[str, np.ndarray]]) -> InitialPoses | None:
     rotation[:, 0] = Rotation.from_matrix(np.stack([one["R"] for one in heads.values()])).as_rotvec()
     rotation[:, 22:25] = np.stack([one["turns"] for one in heads.values()])
     width = min(len(one["exp"]) for one in heads.values())
-    return InitialPoses(
-        frames=tuple(heads),
-        rotation=torch.from_numpy(rotation),
-        expression=torch.from_numpy(np.stack([one["exp"][:width] for one in heads.values()])),
-        betas=None,
-        transl=None,
-        valid=torch.ones(len(heads), dtype=torch.bool),
-        hands="mean",
-    )
-
-
-def _lens(matrix: np.ndarray, clip: Clip, path: Path) -> pycolmap.Camera:
-    if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise UserError(f"{path}: the focal length is not positive: {_REMEDY}")
-    return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
+    expression = np.stack([one["exp"][:width] for one in heads.values()])
+    return initial_poses(list(heads), rotation, expression)

@@ -24,10 +24,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.untrusted import read_numbers
-from stages.ingest.cameras.colmap import find_model, read_model
-from stages.ingest.datasets.fitted import prepared_poses
-from stages.ingest.datasets.recording import Recording, Shot, folder_clip, numbered, only
+from stages.ingest.cameras.calibration_files import find_model, read_model
+from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
+from stages.ingest.datasets.recording import Recording, Shot, select_frames
 from stages.ingest.settings import IngestSettings
+from stages.ingest.video import folder_clip, numbered_files
 
 _REMEDY = "unpack the NeuMan dataset again"
 _LISTS = ("train_split.txt", "test_split.txt")
@@ -41,18 +42,18 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a sequence's folder; UserError where a file of it is malformed."""
-    clip = folder_clip(source / "images", numbered(source / "images"))
-    masks, kind = only(numbered(source / "masks"), clip.pictures), "white"
+    clip = folder_clip(source / "images", numbered_files(source / "images"))
+    masks, kind = select_frames(numbered_files(source / "masks"), clip.pictures), "white"
     if masks is None:
-        masks, kind = only(numbered(source / "segmentations"), clip.pictures), "inverted"
+        masks, kind = select_frames(numbered_files(source / "segmentations"), clip.pictures), "inverted"
     model = find_model(source)
     shot = Shot(
         clip=clip,
         calibration=None if model is None else read_model(model),
-        keypoints=only(numbered(source / "keypoints_whole_body", (".json",)), clip.pictures),
+        keypoints=select_frames(numbered_files(source / "keypoints_whole_body", (".json",)), clip.pictures),
         masks=masks,
         mask_kind=kind,
-        poses=prepared_poses(source, smoothed=False),
+        poses=read_exavatar_poses(source, smoothed=False),
     )
     train, test = _split(source, list(clip.pictures))
     return Recording("neuman", (shot,), train, test)

@@ -18,10 +18,12 @@ from pathlib import Path
 
 from pipeline.errors import UserError
 from pipeline.untrusted import read_numbers
-from stages.ingest.cameras.calibration import Calibration, open_calibration
-from stages.ingest.datasets.fitted import prepared_poses
-from stages.ingest.datasets.recording import STEP, Recording, Shot, folder_clip, numbered, shifted
+from stages.ingest.cameras.calibration import Calibration
+from stages.ingest.cameras.calibration_files import open_calibration
+from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
+from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, renumbered
 from stages.ingest.settings import IngestSettings
+from stages.ingest.video import folder_clip, numbered_files
 
 _REMEDY = "prepare the PERSONA subject again"
 
@@ -40,14 +42,14 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     notes = (f"{', '.join(generated)} are not footage and are left out",) if generated else ()
     if not (source / "test" / "images").is_dir():
         return Recording("persona", tuple(shots), notes=notes)
-    shots.append(_shot(source / "test", STEP))
+    shots.append(_shot(source / "test", SHOT_STEP))
     parts = [frozenset(shot.clip.pictures) for shot in shots]
     return Recording("persona", tuple(shots), parts[0], parts[1], notes)
 
 
 def _shot(folder: Path, first: int) -> Shot:
     """One clip, numbered from ``first``."""
-    pictures = numbered(folder / "images")
+    pictures = numbered_files(folder / "images")
     listed = folder / "frame_idx_list.txt"
     if listed.is_file():
         wanted = frozenset(read_numbers(listed, _REMEDY))
@@ -64,11 +66,11 @@ def _shot(folder: Path, first: int) -> Shot:
         assert given is not None  # a path gives one
         views = {str(new[int(n)]): v for n, v in given.views.items() if n.isdigit() and int(n) in new}
         calibration = Calibration(given.path, given.kind, views, given.metric, given.upright)
-    poses = shifted(prepared_poses(folder, smoothed=False), new)
+    poses = renumbered(read_exavatar_poses(folder, smoothed=False), new)
     return Shot(
         clip,
         calibration,
-        of(numbered(folder / "keypoints_whole_body", (".json",))),
-        of(numbered(folder / "masks")),
+        of(numbered_files(folder / "keypoints_whole_body", (".json",))),
+        of(numbered_files(folder / "masks")),
         poses=poses,
     )

@@ -15,16 +15,12 @@ in the order of names where the calibration's own names differ from the videos'.
 from __future__ import annotations
 
 import dataclasses
-import tomllib
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from pipeline.config.settings import near
 from pipeline.errors import UserError
-from pipeline.untrusted import bounded_bytes
-from stages.ingest.cameras.calibration import Calibration
-from stages.ingest.cameras.rig import read_qualisys, read_toml_rig
-from stages.ingest.datasets.recording import STEP, Recording, Shot
+from stages.ingest.cameras.rig import camera_names, read_rig
+from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot
 from stages.ingest.datasets.talkshow import VIDEOS
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import open_clip
@@ -57,22 +53,16 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         )
     own = dict(zip(by_name, names, strict=True)) if set(names) != set(by_name) else {n: n for n in names}
     shots = [
-        _shot(by_name[name], _calibration(path, own[name]), place * STEP)
+        Shot(
+            dataclasses.replace(open_clip(by_name[name]), first=place * SHOT_STEP), read_rig(path, own[name])
+        )
         for place, name in enumerate((train, *(name for name in test if name != train)))
     ]
     if len(shots) == 1:
         return Recording("pose2sim", tuple(shots))
     # How many frames a video has is known once it has been read: what is numbered from STEP is held out.
-    held = frozenset(range(STEP, len(shots) * STEP))
-    return Recording("pose2sim", tuple(shots), frozenset(range(STEP)), held)
-
-
-def _shot(video: Path, calibration: Calibration, first: int) -> Shot:
-    return Shot(dataclasses.replace(open_clip(video), first=first), calibration)
-
-
-def _calibration(path: Path, name: str) -> Calibration:
-    return read_toml_rig(path, name) if path.suffix == ".toml" else read_qualisys(path, name)
+    held = frozenset(range(SHOT_STEP, len(shots) * SHOT_STEP))
+    return Recording("pose2sim", tuple(shots), frozenset(range(SHOT_STEP)), held)
 
 
 def calibration_file(folder: Path) -> Path:
@@ -82,19 +72,3 @@ def calibration_file(folder: Path) -> Path:
     if len(found) != 1:
         raise UserError(f"{folder} holds {len(found)} calibrations (Calib*.toml, *.qca.txt): keep one")
     return found[0]
-
-
-def camera_names(path: Path) -> list[str]:
-    """The cameras of a calibration, in its order; UserError where it is malformed."""
-    content = bounded_bytes(path, 16 << 20, "calibrate again")
-    try:
-        if path.suffix == ".toml":
-            tables = tomllib.loads(content.decode("utf-8"))
-            return [
-                str(table.get("name", key))
-                for key, table in tables.items()
-                if isinstance(table, dict) and "matrix" in table
-            ]
-        return [camera.get("serial", "") for camera in ElementTree.fromstring(content).findall(".//camera")]
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ElementTree.ParseError) as error:
-        raise UserError(f"{path} is no readable calibration ({error}): export it again") from None

@@ -6,14 +6,14 @@
     masks/12.png                     above one half is the person
     cam_params/12.json               {R, t, focal, princpt}, or sparse/ from COLMAP (names image12.jpg)
     keypoints_whole_body/12.json     133 [x, y, score], pixels
-    smplx_init/, smplx_optimized/    see ``fitted``
+    smplx_init/, smplx_optimized/    see ``exavatar_poses``
     frame_list_{all,train,test}.txt  a number a line
 
 Source: the releases of ExAvatar (mks0601/ExAvatar_RELEASE) and FlexiAvatar (yihalem1/FlexiAvatar_Release).
 FlexiAvatar's make_frame_list.py writes the same numbers into all three lists: a test list that is the
 training list holds nothing out, and then the clip's end is. A ``_gen`` folder (generated views) has a
 training list only; its frames are all learnt from. No conversion is needed but that of the poses, which
-``fitted`` states.
+``exavatar_poses`` states.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.untrusted import read_numbers
-from stages.ingest.cameras.calibration import Calibration, open_calibration
-from stages.ingest.cameras.colmap import find_model, read_model
-from stages.ingest.datasets.fitted import prepared_poses
-from stages.ingest.datasets.recording import Recording, Shot, folder_clip, numbered, only
+from stages.ingest.cameras.calibration import Calibration
+from stages.ingest.cameras.calibration_files import find_model, open_calibration, read_model
+from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
+from stages.ingest.datasets.recording import Recording, Shot, select_frames
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, open_clip
+from stages.ingest.video import Clip, folder_clip, numbered_files, open_clip
 
 _REMEDY = "prepare the folder again"
 _SIGNS = ("masks", "cam_params", "keypoints_whole_body", "smplx_init", "smplx_optimized", "sparse")
@@ -49,9 +49,9 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     shot = Shot(
         clip=clip,
         calibration=_listed(_cameras(source, clip), clip if "all" in lists else None),
-        keypoints=_of(numbered(source / "keypoints_whole_body", (".json",)), pictures),
-        masks=_of(numbered(source / "masks"), pictures),
-        poses=prepared_poses(source, smoothed=True),
+        keypoints=_of(numbered_files(source / "keypoints_whole_body", (".json",)), pictures),
+        masks=_of(numbered_files(source / "masks"), pictures),
+        poses=read_exavatar_poses(source, smoothed=True),
     )
     train, test = lists.get("train"), lists.get("test")
     if train is not None and test is None and source.name.endswith("_gen"):
@@ -68,7 +68,7 @@ def _lists(source: Path) -> dict[str, frozenset[int]]:
 
 
 def _clip(source: Path, wanted: frozenset[int] | None) -> Clip:
-    frames = numbered(source / "frames")
+    frames = numbered_files(source / "frames")
     if not frames:
         return open_clip(source / "video.mp4" if (source / "video.mp4").is_file() else source / "frames")
     listed = {frame: file for frame, file in frames.items() if wanted is None or frame in wanted}
@@ -101,4 +101,4 @@ def _listed(calibration: Calibration | None, clip: Clip | None) -> Calibration |
 
 def _of(files: dict[int, Path], pictures: Mapping[int, Path] | None) -> dict[int, Path] | None:
     """The files of the clip's frames; all of them where a video does not say which it has."""
-    return (files or None) if pictures is None else only(files, pictures)
+    return (files or None) if pictures is None else select_frames(files, pictures)

@@ -1,35 +1,35 @@
-"""What an adapter makes of a dataset's folder, and what adapters share."""
+"""A dataset's folder as footage with what came with it, and what the adapters share."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import torch
 
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
-from stages.ingest.cameras.calibration import Calibration
-from stages.ingest.video import PICTURES, Clip, read_picture
+from stages.ingest.cameras.calibration import Calibration, pinhole_lens
+from stages.ingest.video import Clip
 
-STEP = 100_000
+SHOT_STEP = 100_000
 """Frame numbers of the n-th further shot begin at n times this."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
-    """One camera's footage and what came with it; None where nothing did.
+    """One camera's footage and what came with it, None where nothing did.
 
     Attributes:
         clip: the footage; its frame numbers are those of everything else here, and of no other shot.
         calibration: cameras, by frame number or one that stands still.
         keypoints: frame number -> JSON file.
         masks: frame number -> picture.
-        mask_kind: how those are read, see ``detections.MASK_KINDS``.
+        mask_kind: how those are read, see ``external_detections.read_given_mask``.
         poses: of some frames, roots in the axes of each frame's camera.
     """
 
@@ -59,40 +59,47 @@ class Recording:
     notes: tuple[str, ...] = ()
 
 
-def numbered(folder: Path, suffixes: Sequence[str] = PICTURES) -> dict[int, Path]:
-    """Frame number -> file, sorted: the last run of digits in each name; empty without such a folder.
-
-    Raises:
-        UserError: two files of one frame.
-    """
-    found: dict[int, Path] = {}
-    for file in sorted(folder.iterdir()) if folder.is_dir() else []:
-        digits = re.findall(r"\d+", file.stem)
-        if file.suffix.lower() not in suffixes or file.name.startswith(".") or not digits:
-            continue
-        number = int(digits[-1])  # what precedes it is the camera, the take or a word
-        if number in found:
-            raise UserError(f"{file} and {found[number].name} both name frame {number}: keep one")
-        found[number] = file
-    return dict(sorted(found.items()))
-
-
-def folder_clip(path: Path, pictures: Mapping[int, Path], fps: float = 0.0) -> Clip:
-    """A clip of numbered pictures.
-
-    Raises:
-        UserError: there are none, or the first is damaged.
-    """
-    if not pictures:
-        raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): unpack the dataset there")
-    ordered = dict(sorted(pictures.items()))
-    height, width = read_picture(next(iter(ordered.values()))).shape[:2]
-    return Clip(path, width, height, fps, len(ordered), ordered)
-
-
-def only(files: Mapping[int, Path], frames: Sequence[int] | Mapping[int, Any]) -> dict[int, Path] | None:
+def select_frames(
+    files: Mapping[int, Path], frames: Sequence[int] | Mapping[int, Any]
+) -> dict[int, Path] | None:
     """The files of some frames; None where there are none."""
     return {frame: file for frame, file in files.items() if frame in frames} or None
+
+
+_PER_FRAME = ("rotation", "expression", "transl", "valid", "hand_pca")
+
+
+def renumbered(poses: InitialPoses | None, frames: Mapping[int, int]) -> InitialPoses | None:
+    """The poses under other frame numbers, old -> new; others are left out, and None stands for no pose."""
+    rows = [row for row, frame in enumerate(poses.frames) if frame in frames] if poses else []
+    if poses is None or not rows:
+        return None
+    chosen = torch.tensor(rows)
+    parts = {n: getattr(poses, n)[chosen] for n in _PER_FRAME if getattr(poses, n) is not None}
+    return dataclasses.replace(poses, frames=tuple(frames[poses.frames[row]] for row in rows), **parts)
+
+
+def join_poses(poses: Sequence[InitialPoses | None]) -> InitialPoses | None:
+    """Poses of several shots as one; None where a shot has none."""
+    known = [one for one in poses if one is not None]
+    if not known or len(known) < len(poses):
+        return None
+    together: dict[str, Any] = {
+        name: torch.cat([getattr(one, name) for one in known])
+        for name in _PER_FRAME
+        if all(getattr(one, name) is not None for one in known)
+    }
+    frames = tuple(frame for one in known for frame in one.frames)
+    return dataclasses.replace(known[0], frames=frames, **together)
+
+
+def read_array(table: Any, key: str, shape: tuple[int, ...], where: Path | str, remedy: str) -> np.ndarray:
+    """``table[key]`` as finite float64 of a shape; -1 in it stands for any length.
+
+    Raises:
+        UserError: no table, no such entry, or something else; ``where`` names the file.
+    """
+    return numbers(entry(table, key, where, remedy), shape, f"{where}, '{key}'", remedy)
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str, remedy: str) -> np.ndarray:
@@ -110,21 +117,15 @@ def numbers(value: Any, shape: tuple[int, ...], where: str, remedy: str) -> np.n
     return array
 
 
-def entry(table: Any, key: str, where: Path, remedy: str) -> Any:
+def entry(table: Any, key: str, where: Path | str, remedy: str) -> Any:
     """``table[key]``; UserError where it is no table, or has no such entry."""
     if not isinstance(table, dict) or key not in table:
         raise UserError(f"{where} has no '{key}': {remedy}")
     return table[key]
 
 
-def shifted(poses: InitialPoses | None, frames: Mapping[int, int]) -> InitialPoses | None:
-    """The poses under other frame numbers, old -> new; others are left out."""
-    if poses is None:
-        return None
-    rows = [row for row, frame in enumerate(poses.frames) if frame in frames]
-    if not rows:
-        return None
-    chosen = torch.tensor(rows)
-    names = ("rotation", "expression", "transl", "valid", "hand_pca")
-    parts = {n: getattr(poses, n)[chosen] for n in names if getattr(poses, n) is not None}
-    return dataclasses.replace(poses, frames=tuple(frames[poses.frames[row]] for row in rows), **parts)
+def pinhole_of_matrix(matrix: np.ndarray, clip: Clip, where: Path | str, remedy: str) -> pycolmap.Camera:
+    """A lens without distortion from intrinsics [3, 3]; UserError where a focal length is not positive."""
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise UserError(f"{where}: the focal length is not positive: {remedy}")
+    return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_pickle
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
-from stages.ingest.datasets.recording import Recording, Shot, entry, numbers
+from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array
+from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import open_clip
 
@@ -69,7 +69,7 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def _view(table: Any, path: Path) -> CalibratedCamera:
     def number(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        return numbers(entry(table, key, path, _REMEDY), shape, f"{path}, '{key}'", _REMEDY)
+        return read_array(table, key, shape, path, _REMEDY)
 
     size = [int(number(key, (-1,))[0]) for key in ("width", "height")]
     focal = number("focal_length", (-1,))
@@ -81,7 +81,7 @@ def _view(table: Any, path: Path) -> CalibratedCamera:
 
 
 def _poses(table: Any, path: Path) -> InitialPoses:
-    count = len(numbers(entry(table, "body_pose_axis", path, _REMEDY), (-1, 63), f"{path}", _REMEDY))
+    count = len(read_array(table, "body_pose_axis", (-1, 63), path, _REMEDY))
 
     def number(key: str, width: int) -> np.ndarray:
         value = entry(table, key, path, _REMEDY)
@@ -91,22 +91,6 @@ def _poses(table: Any, path: Path) -> InitialPoses:
     for key, width, joint in _PARTS:
         rotation[:, joint : joint + width // 3] = number(key, width).reshape(count, -1, 3)
     hands = np.stack([number(f"{side}_hand_pose", -1) for side in ("left", "right")], axis=1)
-    shift = numbers(
-        entry(table, "camera_transl", path, _REMEDY), (-1, 3), f"{path}, 'camera_transl'", _REMEDY
-    )
-    transl = number("transl", 3) + shift
-    full = hands.shape[2] == 45
-    if full:
-        rotation[:, 25:] = hands.reshape(count, 30, 3)
-    return InitialPoses(
-        frames=tuple(range(count)),
-        rotation=torch.from_numpy(rotation),
-        expression=torch.from_numpy(number("expression", -1)),
-        betas=torch.from_numpy(
-            numbers(entry(table, "betas", path, _REMEDY), (-1,), f"{path}, 'betas'", _REMEDY)
-        ),
-        transl=torch.from_numpy(transl),
-        valid=torch.ones(count, dtype=torch.bool),
-        hands="mean",
-        hand_pca=None if full else torch.from_numpy(hands),
-    )
+    transl = number("transl", 3) + read_array(table, "camera_transl", (-1, 3), path, _REMEDY)
+    expression, betas = number("expression", -1), read_array(table, "betas", (-1,), path, _REMEDY)
+    return initial_poses(range(count), rotation, expression, betas, transl, hands=hands)

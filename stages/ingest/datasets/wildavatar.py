@@ -9,7 +9,7 @@
 Source: WildAvatar's release (zenodo 11526806) and its prepare_data. The poses are SMPL's and have no
 translation: the body turns about its root joint at the origin of its own axes, and the extrinsics
 (world-to-camera, OpenCV axes, metres) say where the camera is. So each frame has a camera of its own, and
-the world is the person's. Conversion of the 72 numbers: ``smpl``.
+the world is the person's. Conversion of the 72 numbers: ``smplx_poses``.
 """
 
 from __future__ import annotations
@@ -23,11 +23,17 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import parse_json
-from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation, pinhole_lens
-from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
-from stages.ingest.datasets.smpl import ROOT, smpl_poses
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation
+from stages.ingest.datasets.recording import (
+    Recording,
+    Shot,
+    pinhole_of_matrix,
+    read_array,
+    select_frames,
+)
+from stages.ingest.datasets.smplx_poses import SMPL_ROOT, smpl_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip
+from stages.ingest.video import Clip, folder_clip, numbered_files
 
 _REMEDY = "unpack the WildAvatar subject again"
 _SHAPES = (("cam_intrinsics", (3, 3)), ("cam_extrinsics", (4, 4)), ("poses", (72,)), ("betas", (-1,)))
@@ -40,7 +46,7 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a subject's folder; UserError where a file of it is malformed."""
-    clip = folder_clip(source / "images", numbered(source / "images"))
+    clip = folder_clip(source / "images", numbered_files(source / "images"))
     path = source / "metadata.json"
     frames = _frames(parse_json(path, _REMEDY), path)
     frames = {frame: one for frame, one in frames.items() if frame in clip.pictures}
@@ -48,7 +54,7 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         raise UserError(f"{path} describes none of the pictures in {clip.path}: {_REMEDY}")
     views = {str(frame): _view(one, clip, f"{path}, frame {frame}") for frame, one in frames.items()}
     calibration = Calibration(path, "WildAvatar", views, metric=True, upright=False)
-    masks = only(numbered(source / "masks"), clip.pictures)
+    masks = select_frames(numbered_files(source / "masks"), clip.pictures)
     return Recording("wildavatar", (Shot(clip, calibration, None, masks, "white", _poses(frames)),))
 
 
@@ -60,19 +66,14 @@ def _frames(table: Any, path: Path) -> dict[int, dict[str, np.ndarray]]:
         if not name.isdigit():
             continue  # "start", the clip's second in the video
         where = f"{path}, frame {name}"
-        found[int(name)] = {
-            key: numbers(entry(value, key, path, _REMEDY), shape, f"{where}, '{key}'", _REMEDY)
-            for key, shape in _SHAPES
-        }
+        found[int(name)] = {key: read_array(value, key, shape, where, _REMEDY) for key, shape in _SHAPES}
     return dict(sorted(found.items()))
 
 
 def _view(frame: dict[str, np.ndarray], clip: Clip, where: str) -> CalibratedCamera:
-    matrix, extrinsics = frame["cam_intrinsics"], frame["cam_extrinsics"]
-    if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise UserError(f"{where}: the focal length is not positive: {_REMEDY}")
+    extrinsics = frame["cam_extrinsics"]
     check_rotation(extrinsics[:3, :3], where)
-    lens = pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
+    lens = pinhole_of_matrix(frame["cam_intrinsics"], clip, where, _REMEDY)
     return CalibratedCamera(lens, extrinsics[:3, :3], extrinsics[:3, 3])
 
 
@@ -80,6 +81,6 @@ def _poses(frames: dict[int, dict[str, np.ndarray]]) -> InitialPoses:
     poses = np.stack([one["poses"] for one in frames.values()])
     extrinsics = np.stack([one["cam_extrinsics"] for one in frames.values()])
     root = extrinsics[:, :3, :3] @ Rotation.from_rotvec(poses[:, :3]).as_matrix()
-    pelvis = extrinsics[:, :3, :3] @ ROOT + extrinsics[:, :3, 3]  # the root joint stays where it rests
+    pelvis = extrinsics[:, :3, :3] @ SMPL_ROOT + extrinsics[:, :3, 3]  # the root joint stays where it rests
     betas = np.median([one["betas"] for one in frames.values()], axis=0)
     return smpl_poses(list(frames), poses, root, pelvis, betas)

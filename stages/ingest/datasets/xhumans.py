@@ -21,18 +21,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
-import torch
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_npz, read_pickle
-from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation, pinhole_lens
-from stages.ingest.cameras.gaps import Extrinsics
-from stages.ingest.datasets.recording import Recording, Shot, entry, folder_clip, numbered, numbers, only
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation
+from stages.ingest.cameras.extrinsics import Extrinsics
+from stages.ingest.datasets.recording import (
+    Recording,
+    Shot,
+    entry,
+    numbers,
+    pinhole_of_matrix,
+    read_array,
+    select_frames,
+)
+from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip
+from stages.ingest.video import folder_clip, numbered_files
 
 _REMEDY = "unpack the X-Humans take again"
 _BODY = (("global_orient", 3, 0), ("body_pose", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
@@ -47,18 +54,18 @@ def recognises(folder: Path) -> bool:
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a take's folder; UserError where a file of it is malformed."""
     render = source / "render"
-    clip = folder_clip(render / "image", numbered(render / "image"), 30.0)
+    clip = folder_clip(render / "image", numbered_files(render / "image"), 30.0)
     path = render / "cameras.npz"
     table = read_npz(path, _REMEDY)
     cameras = _cameras(table, path, list(clip.pictures))
-    lens = _lens(numbers(entry(table, "intrinsic", path, _REMEDY), (3, 3), f"{path}", _REMEDY), clip)
+    lens = pinhole_of_matrix(read_array(table, "intrinsic", (3, 3), path, _REMEDY), clip, path, _REMEDY)
     views = {str(frame): CalibratedCamera(lens, *pose) for frame, pose in cameras.items()}
     shot = Shot(
         clip=clip,
         calibration=Calibration(path, "X-Humans", views, metric=True, upright=False),
-        keypoints=only(numbered(render / "keypoints_whole_body", (".json",)), clip.pictures),
-        masks=only(numbered(render / "mask"), clip.pictures),
-        poses=_poses(numbered(source / "SMPLX", (".pkl",)), cameras),
+        keypoints=select_frames(numbered_files(render / "keypoints_whole_body", (".json",)), clip.pictures),
+        masks=select_frames(numbered_files(render / "mask"), clip.pictures),
+        poses=_poses(numbered_files(source / "SMPLX", (".pkl",)), cameras),
     )
     return Recording("xhumans", (shot,))
 
@@ -80,12 +87,6 @@ def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, 
     return found
 
 
-def _lens(matrix: np.ndarray, clip: Clip) -> pycolmap.Camera:
-    if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise UserError(f"{clip.path}: the focal length is not positive: {_REMEDY}")
-    return pinhole_lens(clip.width, clip.height, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
-
-
 def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPoses | None:
     known = {frame: file for frame, file in files.items() if frame in cameras}
     if not known:
@@ -96,7 +97,7 @@ def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPos
         value = read_pickle(path, _REMEDY)
 
         def number(key: str, count: int, value: Any = value, path: Path = path) -> np.ndarray:
-            return numbers(entry(value, key, path, _REMEDY), (count,), f"{path}, '{key}'", _REMEDY)
+            return read_array(value, key, (count,), path, _REMEDY)
 
         for key, count, joint in _BODY:
             rotation[row, joint : joint + count // 3] = number(key, count).reshape(-1, 3)
@@ -107,28 +108,11 @@ def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPos
         columns["expression"].append(number("expression", -1))
         columns["betas"].append(number("betas", -1))
         columns["transl"].append(np.stack([number("transl", 3), shift]))
-    return _assembled(list(known), rotation, columns, np.stack([cameras[frame][0] for frame in known]))
-
-
-def _assembled(
-    frames: list[int], rotation: np.ndarray, columns: dict[str, list[np.ndarray]], turns: np.ndarray
-) -> InitialPoses:
-    """The poses of all frames as one."""
     hands, transl = np.stack(columns["hands"]), np.stack(columns["transl"])
-    full = hands.shape[2] == 45
-    if full:
-        rotation[:, 25:] = hands.reshape(len(frames), 30, 3)
-    return InitialPoses(
-        frames=tuple(frames),
-        rotation=torch.from_numpy(rotation),
-        expression=torch.from_numpy(np.stack(columns["expression"])),
-        betas=torch.from_numpy(np.median(np.stack(columns["betas"]), axis=0)),
-        transl=torch.from_numpy(_place(transl[:, 0], transl[:, 1], turns)),
-        valid=torch.ones(len(frames), dtype=torch.bool),
-        pivot=torch.tensor(ROOT),
-        hands="mean",
-        hand_pca=None if full else torch.from_numpy(hands),
-    )
+    place = _place(transl[:, 0], transl[:, 1], np.stack([cameras[frame][0] for frame in known]))
+    betas = np.median(np.stack(columns["betas"]), axis=0)
+    expression = np.stack(columns["expression"])
+    return initial_poses(list(known), rotation, expression, betas, place, np.array(ROOT), hands)
 
 
 def _place(transl: np.ndarray, shift: np.ndarray, turns: np.ndarray) -> np.ndarray:

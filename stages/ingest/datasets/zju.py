@@ -11,7 +11,7 @@ Source: the readers of GauHuman (scene/dataset_readers.py) and GART (lib_data/zj
 for Rh and Th. Conversions: T is millimetres. K and D are OpenCV's, which counts from the centre of the
 first pixel, so half a pixel is added; the distortion is taken out of the pictures. EasyMocap turns the
 posed body about the ORIGIN, x = R(Rh) x_posed + Th with the root's own rotation zero, so SMPL's root joint
-comes to be at R(Rh) J_0 + Th (``smpl`` says what J_0 is, and how 72 numbers become SMPL-X's).
+comes to be at R(Rh) J_0 + Th (``smplx_poses`` says what J_0 is, and how 72 numbers become SMPL-X's).
 
 Read in two ways. As the paper and FlexiAvatar do: one camera as a video, ``ingest.camera_name`` says which
 by its number, 4 if nothing is said. As GauHuman does: ``ingest.test_cameras=others``, or numbers, holds out
@@ -33,10 +33,11 @@ from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import inside, read_npy
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
-from stages.ingest.cameras.world import settle
-from stages.ingest.datasets.recording import STEP, Recording, Shot, entry, folder_clip, numbers
-from stages.ingest.datasets.smpl import ROOT, smpl_poses
+from stages.ingest.cameras.extrinsics import to_upright_world
+from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, entry, numbers, read_array
+from stages.ingest.datasets.smplx_poses import SMPL_ROOT, smpl_poses
 from stages.ingest.settings import IngestSettings
+from stages.ingest.video import folder_clip
 
 FPS = 50.0
 TRAIN_CAMERA = 4
@@ -45,10 +46,10 @@ _REMEDY = "unpack the ZJU-MoCap subject again"
 
 
 @dataclasses.dataclass(frozen=True)
-class Eye:
-    """A camera: as it is handed on, and as annots.npy has it (world-to-camera, metres)."""
+class RigCamera:
+    """A camera in our world, and as annots.npy has it (world-to-camera, metres)."""
 
-    view: CalibratedCamera
+    calibrated: CalibratedCamera
     rotation: np.ndarray
     translation: np.ndarray
 
@@ -66,11 +67,11 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     count = len(names[0])
     train = _camera(settings.camera_name or str(TRAIN_CAMERA), count, path)
     test = _held_out(settings.test_cameras, train, count, path)
-    eyes = _eyes(annots, [train, *test], source, names)
+    cameras = _cameras(annots, [train, *test], source, names)
     several = bool(test)
-    shots = [_shot(source, names, train, 0, eyes[0], list(TRAIN_FRAMES) if several else None, path)]
+    shots = [_shot(source, names, train, 0, cameras[0], list(TRAIN_FRAMES) if several else None, path)]
     for place, camera in enumerate(test, start=1):
-        shots.append(_shot(source, names, camera, place * STEP, eyes[place], list(TEST_FRAMES), path))
+        shots.append(_shot(source, names, camera, place * SHOT_STEP, cameras[place], list(TEST_FRAMES), path))
     if not several:
         return Recording("zju", tuple(shots))
     held = frozenset(frame for shot in shots[1:] for frame in shot.clip.pictures)
@@ -102,8 +103,8 @@ def _held_out(names: tuple[str, ...], train: int, count: int, path: Path) -> lis
     return [camera for camera in (_camera(name, count, path) for name in names) if camera != train]
 
 
-def _eyes(annots: Any, cameras: list[int], source: Path, names: list[list[str]]) -> list[Eye]:
-    """The cameras in one world, in which the first one stands as ``cameras.world`` says."""
+def _cameras(annots: Any, cameras: list[int], source: Path, names: list[list[str]]) -> list[RigCamera]:
+    """The cameras in one upright world, whose origin is the first one (``cameras.extrinsics``)."""
     path = source / "annots.npy"
     tables = entry(annots, "cams", path, _REMEDY)
     rotations, translations, lenses = [], [], []
@@ -119,9 +120,11 @@ def _eyes(annots: Any, cameras: list[int], source: Path, names: list[list[str]])
         translations.append(parts["T"] / 1000.0)
         clip = folder_clip(source, {0: inside(source, names[0][camera], path)})
         lenses.append(_lens(parts["K"], parts["D"], clip.width, clip.height))
-    settled = settle(np.stack(rotations), np.stack(translations))
+    settled = to_upright_world(np.stack(rotations), np.stack(translations))
     rows = zip(lenses, *settled, rotations, translations, strict=True)
-    return [Eye(CalibratedCamera(lens, turn, shift), *original) for lens, turn, shift, *original in rows]
+    return [
+        RigCamera(CalibratedCamera(lens, turn, shift), *original) for lens, turn, shift, *original in rows
+    ]
 
 
 def _lens(matrix: np.ndarray, bend: np.ndarray, width: int, height: int) -> pycolmap.Camera:
@@ -136,7 +139,7 @@ def _shot(
     names: list[list[str]],
     camera: int,
     first: int,
-    eye: Eye,
+    view: RigCamera,
     chosen: list[int] | None,
     path: Path,
 ) -> Shot:
@@ -146,15 +149,15 @@ def _shot(
     masks = {frame: _mask(source, names[frame][camera], path) for frame in frames}
     found = {first + frame: mask for frame, mask in masks.items() if mask.is_file()}
     clip = folder_clip(source, {first + frame: file for frame, file in pictures.items()}, FPS)
-    calibration = Calibration(path, "ZJU-MoCap", {EVERY_FRAME: eye.view}, metric=True, upright=True)
-    return Shot(clip, calibration, None, found or None, "nonzero", _poses(source, frames, first, eye))
+    calibration = Calibration(path, "ZJU-MoCap", {EVERY_FRAME: view.calibrated}, metric=True, upright=True)
+    return Shot(clip, calibration, None, found or None, "nonzero", _poses(source, frames, first, view))
 
 
 def _mask(source: Path, name: str, path: Path) -> Path:
     return inside(source / "mask", name, path).with_suffix(".png")
 
 
-def _poses(source: Path, frames: list[int], first: int, eye: Eye) -> InitialPoses | None:
+def _poses(source: Path, frames: list[int], first: int, view: RigCamera) -> InitialPoses | None:
     """SMPL's poses in the axes of one camera."""
     paths = {frame: source / "smpl_params" / f"{frame}.npy" for frame in frames}
     known = [frame for frame, path in paths.items() if path.is_file()]
@@ -164,12 +167,12 @@ def _poses(source: Path, frames: list[int], first: int, eye: Eye) -> InitialPose
     for frame in known:
         value = read_npy(paths[frame], _REMEDY)
         parts = {
-            key: numbers(entry(value, key, paths[frame], _REMEDY), shape, f"{paths[frame]}, '{key}'", _REMEDY)
+            key: read_array(value, key, shape, paths[frame], _REMEDY)
             for key, shape in (("Rh", (3,)), ("Th", (3,)), ("poses", (72,)), ("shapes", (-1,)))
         }
         turn = Rotation.from_rotvec(parts["Rh"]).as_matrix()
-        turns.append(eye.rotation @ turn)
-        places.append(eye.rotation @ (turn @ ROOT + parts["Th"]) + eye.translation)
+        turns.append(view.rotation @ turn)
+        places.append(view.rotation @ (turn @ SMPL_ROOT + parts["Th"]) + view.translation)
         poses.append(parts["poses"])
         shapes.append(parts["shapes"])
     placed = [first + frame for frame in known]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Landmarks, joint_index, rasterize
 from pipeline.clip.camera import facing_camera, project
-from stages.ingest.mannequin.attire import Fields, Measures, Style, garments, make_style, measure
+from stages.ingest.mannequin.attire import GarmentDepths, Measures, Style, garments, make_style, measure
 from stages.ingest.mannequin.face_paint import Decal, paint_face, paint_print
 
 _SOLE = 0.012  # metres
@@ -67,8 +67,10 @@ class Appearance:
         self._lay_prints(colors, points, fields, float(np.median(footprint)) if len(footprint) else 1.0)
         return colors
 
-    def _lay_prints(self, colors: np.ndarray, points: np.ndarray, fields: Fields, level: float) -> None:
-        """The belt, the shirt's hems and its prints, in place."""
+    def _lay_prints(
+        self, colors: np.ndarray, points: np.ndarray, fields: GarmentDepths, level: float
+    ) -> None:
+        """Paint the belt, the shirt's hems and its prints, in place."""
         trim = (fields.shirt > 0) & (fields.shirt < 0.01) & (points[:, 1] > self.measures.waist + 0.02)
         _fill(colors, trim, np.array(self.style.trim, np.float32) * 0.92)
         belt = (fields.belt > 0) & (np.abs(points[:, 0]) < 0.25)
@@ -155,13 +157,7 @@ class Appearance:
 
 
 def make_appearance(body: BodyModel, landmarks: Landmarks, seed: int) -> Appearance:
-    """The look of a person; equal seeds give equal looks.
-
-    Args:
-        body: the body.
-        landmarks: where the face's features are.
-        seed: the identity's.
-    """
+    """The look of a person; equal seeds give equal looks. ``landmarks`` place the face's features."""
     measures, style = measure(body), make_style(seed)
     chest, back = paint_print(measures, style)
     face = paint_face(body, landmarks, measures, style)
@@ -197,9 +193,9 @@ def dots(points: np.ndarray, period: float, footprint: np.ndarray) -> np.ndarray
     """Balls on a lattice, cut by the surface: 1 inside, [N]."""
     cell = points / np.float32(period)
     cell = cell - np.round(cell)
-    inside = (cell * cell).sum(1) < 0.36**2
+    in_picture = (cell * cell).sum(1) < 0.36**2
     contrast = _contrast(0.7 * period, footprint)
-    return inside * contrast + (1 - contrast) * 0.2
+    return in_picture * contrast + (1 - contrast) * 0.2
 
 
 def noise(points: np.ndarray, period: float, footprint: np.ndarray, seed: int = 0) -> np.ndarray:

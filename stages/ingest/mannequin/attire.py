@@ -1,8 +1,7 @@
-"""What the mannequin wears: where hair and clothes begin and end, and how far they stand off the skin.
+"""The mannequin's hair and clothes: their outlines, and their distance from the skin.
 
 Everything is a function of a place on the template in T pose, in which no two parts of the body touch.
-So the same clothes fit any body of the schema, their seams may cross triangles, and patterns are as
-fine as one likes, whatever the mesh.
+So the same clothes fit any body of the schema, and their seams and patterns do not depend on the mesh.
 """
 
 from __future__ import annotations
@@ -76,8 +75,8 @@ class Style:
 
 
 @dataclasses.dataclass(frozen=True)
-class Fields:
-    """How far inside each garment points are, [N] each, metres, negative outside."""
+class GarmentDepths:
+    """The depth of points inside each garment, [N] each, metres, negative outside."""
 
     hair: np.ndarray
     shirt: np.ndarray
@@ -101,7 +100,7 @@ def make_style(seed: int) -> Style:
 
 
 def measure(body: BodyModel) -> Measures:
-    """Take a body's measures."""
+    """The measures of a body's template."""
     joints = (body.joint_regressor @ body.v_template).double().numpy()
 
     def joint(name: str) -> np.ndarray:
@@ -122,8 +121,8 @@ def measure(body: BodyModel) -> Measures:
     )
 
 
-def garments(points: np.ndarray, measures: Measures, style: Style) -> Fields:
-    """Where points of the template [N, 3] are relative to what is worn over them."""
+def garments(points: np.ndarray, measures: Measures, style: Style) -> GarmentDepths:
+    """The depth of the template's points [N, 3] inside each garment."""
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
     m = measures
     above_eyes, behind_eyes = y - m.eye[1], m.eye[2] - z
@@ -143,11 +142,11 @@ def garments(points: np.ndarray, measures: Measures, style: Style) -> Fields:
     collar = np.where(x > 0.11, m.neck[1] + 0.2, collar)  # the shoulders are no neck
     shirt = np.minimum(np.minimum(sleeve - x, collar - y), y - m.waist)
     trousers = np.minimum(m.waist - y, y - m.ankle - SHOE_TOP)
-    return Fields(hair, shirt, trousers, m.ankle + SHOE_TOP - y, 0.016 - np.abs(y - m.waist + 0.014))
+    return GarmentDepths(hair, shirt, trousers, m.ankle + SHOE_TOP - y, 0.016 - np.abs(y - m.waist + 0.014))
 
 
 def surface_offset(body: BodyModel, measures: Measures, style: Style) -> Tensor:
-    """How far hair and clothes move the template's vertices: [V, 3] float32, metres."""
+    """The offset of the template's vertices by hair and clothes: [V, 3] float32, metres."""
     fields = garments(body.v_template.double().numpy(), measures, style)
     height = (
         HAIR * _rise(fields.hair, 0.03)

@@ -1,4 +1,4 @@
-"""Cameras: the one that the pipeline is given, and those that it never sees."""
+"""The pipeline's camera before the body, and the unseen ones about it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, joint_index, pose_body
 from pipeline.clip.camera import Camera, facing_camera
-from stages.ingest.mannequin.motion import Motion
+from stages.ingest.mannequin.motion import MannequinMotion
 from stages.ingest.mannequin.spec import VIEWS, MannequinSpec
 
 FOCAL = {"full": 1.2, "upper": 1.5, "head": 2.2}
@@ -26,8 +26,8 @@ _SAMPLES = 24  # frames that are looked at to place the camera
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
-    """A body in its place before a camera.
+class FramedMotion:
+    """The pipeline's camera and the motion placed before it.
 
     Attributes:
         camera: the one that the pipeline is given; it stands at the world's origin.
@@ -40,17 +40,15 @@ class Shot:
     poses: Poses
 
 
-def frame_shot(spec: MannequinSpec, body: BodyModel, identity: Identity, motion: Motion) -> Shot:
-    """Put the body where the framing wants it.
+def frame_motion(
+    spec: MannequinSpec, body: BodyModel, identity: Identity, motion: MannequinMotion
+) -> FramedMotion:
+    """The body's motion placed so that the camera sees what the framing asks for.
 
     ``full`` shows the whole body in every frame, ``upper`` what is above the waist, ``head`` what is
     above the collarbones; hands may leave the picture in the latter two.
 
-    Args:
-        spec: framing and size are read.
-        body: the body.
-        identity: with clothes and hair.
-        motion: what it does.
+    Framing and size of ``spec`` are read; ``identity`` is with clothes and hair.
     """
     camera = facing_camera(spec.size, spec.size, FOCAL[spec.framing] * spec.size)
     root = motion.root * torch.tensor(WANDERING[spec.framing])
@@ -73,10 +71,10 @@ def frame_shot(spec: MannequinSpec, body: BodyModel, identity: Identity, motion:
         middle[1] += (1 - _FILL) / _FILL * float(top - bottom) / 2
     centre = torch.tensor([0.0, 0.0, -distance])
     poses = Poses(tuple(range(spec.frames)), motion.rotation, motion.expression, root + (centre - middle))
-    return Shot(camera, centre, poses)
+    return FramedMotion(camera, centre, poses)
 
 
-def unseen_camera(shot: Shot, name: str) -> Camera:
+def unseen_camera(shot: FramedMotion, name: str) -> Camera:
     """A camera of ``VIEWS``: the pipeline's own, carried about the middle of what is framed."""
     azimuth, elevation = (math.radians(angle) for angle in VIEWS[name])
     about = roma.euler_to_rotmat("YX", [azimuth, -elevation])
@@ -85,8 +83,8 @@ def unseen_camera(shot: Shot, name: str) -> Camera:
     return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
 
 
-def inside(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Whether pixels [..., 2] lie in the picture, [...] bool."""
+def in_picture(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """True where pixels [..., 2] lie in the picture, [...] bool."""
     return np.logical_and.reduce((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=-1)
 
 

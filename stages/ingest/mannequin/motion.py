@@ -1,4 +1,4 @@
-"""How the mannequin moves: generated motions that add up, or motion capture. Radians and metres."""
+"""The mannequin's motion: generated layers that add up, or motion capture. Radians and metres."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
-    """A motion that no place in the world is given to yet, T frames, float32.
+class MannequinMotion:
+    """A motion before it is placed in the world, T frames, float32.
 
     Attributes:
         rotation: [T, 55, 3], rotation vectors relative to the parent joint.
@@ -66,14 +66,15 @@ class _Draft:
         return height * np.clip((self.wave(-1, 1, slow, quick) - threshold) / (1 - threshold), 0, 1)
 
 
-def make_motion(spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], expressions: int) -> Motion:
+def make_motion(
+    spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], expressions: int
+) -> MannequinMotion:
     """The motion that a spec names.
 
     Args:
         spec: motion, frames, fps and seed are read.
-        joints: [55, 3], the body's rest joints.
-        parents: its kinematic tree.
-        expressions: E, how many expression parameters the body has.
+        joints, parents: the body's rest joints [55, 3] and its kinematic tree.
+        expressions: E, the number of the body's expression parameters.
 
     Raises:
         UserError: the BVH file is missing or cannot be used.
@@ -90,13 +91,13 @@ def make_motion(spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], e
         _LAYERS[name](draft)
     if not spec.is_bvh:
         _stand(draft)
-        return Motion(
+        return MannequinMotion(
             _composed(draft.turns), torch.from_numpy(draft.expression).float(), torch.zeros(spec.frames, 3)
         )
     rotation, root = retarget(read_bvh(Path(spec.motion)), joints, parents, spec.frames, spec.fps)
     face = [joint_index(name) for name in ("jaw", "left_eye", "right_eye")]
     rotation[:, face] = _composed(draft.turns)[:, face]
-    return Motion(rotation, torch.from_numpy(draft.expression).float(), root)
+    return MannequinMotion(rotation, torch.from_numpy(draft.expression).float(), root)
 
 
 def _composed(turns: np.ndarray) -> Tensor:

@@ -1,4 +1,4 @@
-"""Who the mannequin is: a random identity with truth in all three of its parts."""
+"""The mannequin's random identity: betas, joint offsets and face offsets."""
 
 from __future__ import annotations
 
@@ -20,10 +20,7 @@ def make_identity(body: BodyModel, seed: int) -> Identity:
 
     Joint offsets are those of the large limbs, mirrored from left to right; face offsets are smooth,
     symmetric, and zero outside the face, as the method supposes them (sections 3.1 and A).
-
-    Args:
-        body: the body.
-        seed: equal seeds give equal people.
+    Equal seeds give equal people.
     """
     rng = np.random.default_rng([seed, 2])
     betas = np.clip(rng.normal(0, BETA, body.shape_directions.shape[2]), -BETA_LIMIT, BETA_LIMIT)

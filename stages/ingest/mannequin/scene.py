@@ -1,4 +1,4 @@
-"""Filming the mannequin: one lamp, a still background, two samples a pixel in each direction."""
+"""The mannequin rendered: one lamp, a still background, two samples a pixel in each direction."""
 
 from __future__ import annotations
 
@@ -10,31 +10,36 @@ import torch
 from torch import Tensor
 
 from pipeline.body import (
+    PARTS,
     BodyModel,
     Identity,
     expression_offsets,
     joint_transforms,
     linear_blend_skinning,
+    part_labels,
     pose_offsets,
     rasterize,
     rest_joints,
     rest_vertices,
     vertex_normals,
 )
+from pipeline.body.joints import BODY_POSE
+from pipeline.body.parts import joint_parts
 from pipeline.clip.camera import Camera
 from stages.ingest.mannequin.appearance import Appearance
-from stages.ingest.mannequin.framing import Shot
-from stages.ingest.mannequin.limbs import limbs_of_vertices
+from stages.ingest.mannequin.framing import FramedMotion
 
 SAMPLES = 2
 AMBIENT, SKY, LAMP = 0.50, 0.10, 0.48
 LAMP_FROM = (-0.45, 0.60, 0.66)  # in the world: from the left of the pipeline's camera, and above it
 GRAIN = 1.2  # of 255, standard deviation
+_LIMBS = {"left_arm": 1, "left_hand": 1, "right_arm": 2, "right_hand": 2, "left_leg": 3, "right_leg": 4}
+_OF_PART = np.array([_LIMBS.get(part, 0) for part in PARTS], np.int8)
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
-    """What a camera sees.
+class FilmedFrame:
+    """One frame as a camera sees it.
 
     Attributes:
         image: [H, W, 3] uint8 RGB.
@@ -51,13 +56,10 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Everything that is before the cameras.
+    """The clothed body, its motion and its looks.
 
     Attributes:
-        body: the body.
         clothed: the person, hair and clothes included as offsets of the template.
-        appearance: colours.
-        shot: cameras and motion.
         seed: of background and grain.
         rest: [V, 3], the clothed surface in T pose without expression.
         transforms: [T, 55, 3, 4], of the joints.
@@ -67,7 +69,7 @@ class Scene:
     body: BodyModel
     clothed: Identity
     appearance: Appearance
-    shot: Shot
+    shot: FramedMotion
     seed: int
     rest: Tensor
     transforms: Tensor
@@ -85,22 +87,30 @@ class Scene:
         )
 
 
-def make_scene(body: BodyModel, clothed: Identity, appearance: Appearance, shot: Shot, seed: int) -> Scene:
-    """Put a person with a look and a motion before the cameras."""
+def limbs_of_vertices(body: BodyModel) -> np.ndarray:
+    """The limb of each vertex: [V] int8; 0 on trunk and head, 1 to 4 on arms and legs."""
+    return _OF_PART[part_labels(body).numpy()]
+
+
+def limbs_of_joints(joint: Tensor) -> np.ndarray:
+    """The limb of points [K] that are joints; -1 for fingers, points of the surface (-1), trunk and head."""
+    limbs = _OF_PART[joint_parts().numpy()]
+    limbs[limbs == 0] = -1
+    limbs[BODY_POSE.stop :] = -1  # fingers do hide one another
+    return np.where(joint.numpy() >= 0, limbs[joint.clamp_min(0).numpy()], -1)
+
+
+def make_scene(
+    body: BodyModel, clothed: Identity, appearance: Appearance, shot: FramedMotion, seed: int
+) -> Scene:
+    """The scene of a person with a look and a motion."""
     transforms = joint_transforms(shot.poses.rotation, rest_joints(body, clothed), body.parents)
     rest, limbs = rest_vertices(body, clothed), limbs_of_vertices(body)
     return Scene(body, clothed, appearance, shot, seed, rest, transforms, limbs)
 
 
-def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> Picture:
-    """One frame of one camera.
-
-    Args:
-        scene: what is filmed.
-        row: the frame.
-        camera: the view.
-        background: [H, W, 3] float32, as by ``make_background``.
-    """
+def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> FilmedFrame:
+    """One frame of one camera before a ``background`` [H, W, 3] float32, as by :func:`make_background`."""
     size = (camera.width, camera.height)
     vertices, faces = scene.vertices(row), scene.body.faces
     fine = camera.resized(size[0] * SAMPLES, size[1] * SAMPLES)
@@ -121,7 +131,7 @@ def film(scene: Scene, row: int, camera: Camera, background: np.ndarray) -> Pict
     image = pixels[..., :3] + (1 - pixels[..., 3:]) * background
     grain = np.random.default_rng([scene.seed, 5, row]).standard_normal(image.shape, np.float32)
     image = np.clip(np.round(image + GRAIN * grain), 0, 255).astype(np.uint8)
-    return Picture(image, np.round(pixels[..., 3] * 255).astype(np.uint8), raster.depth, limb)
+    return FilmedFrame(image, np.round(pixels[..., 3] * 255).astype(np.uint8), raster.depth, limb)
 
 
 def make_background(camera: Camera, seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a mannequin clip shows, in a few words. Imports nothing heavy, so that settings can check it."""
+"""The description of a mannequin's clip. Imports nothing heavy, so that settings can check it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.config.settings import SETTINGS, Count, Fraction, FrameRate, Seed,
 Framing = Literal["full", "upper", "head"]
 Detector = Literal["mediapipe", "heatmap"]
 UnseenView = Literal["left", "right", "back", "above"]
-FilmedFrames = Annotated[int, Field(ge=2, le=1_000_000)]
+FrameCount = Annotated[int, Field(ge=2, le=1_000_000)]
 Noise = Annotated[float, Field(ge=0, le=100)]
 
 FRAMINGS: tuple[Framing, ...] = get_args(Framing)
@@ -33,12 +33,12 @@ DEFAULT_MOTION: Mapping[Framing, str] = {
 
 
 def is_bvh(motion: str) -> bool:
-    """Whether a motion is a motion-capture file."""
+    """True where a motion is a motion-capture file."""
     return motion.lower().endswith(".bvh")
 
 
 def check_motion(motion: str) -> None:
-    """Refuses, with a ValueError, what is neither empty nor a BVH file nor names of ``LAYERS``."""
+    """Refuse a motion that is neither empty nor a BVH file nor names of ``LAYERS``; ValueError."""
     unknown = [] if is_bvh(motion) or not motion else sorted({*motion.split("+")} - {*LAYERS})
     if unknown:
         raise ValueError(
@@ -67,7 +67,7 @@ class MannequinSpec:
 
     framing: Framing = "full"
     motion: str = ""
-    frames: FilmedFrames = 60
+    frames: FrameCount = 60
     size: Side = 256
     fps: FrameRate = 25.0
     seed: Seed = 0
@@ -85,7 +85,7 @@ class MannequinSpec:
 
     @property
     def is_bvh(self) -> bool:
-        """Whether ``motion`` is a motion-capture file."""
+        """True where ``motion`` is a motion-capture file."""
         return is_bvh(self.motion)
 
     @property
@@ -96,7 +96,7 @@ class MannequinSpec:
         return tuple((self.motion or DEFAULT_MOTION[self.framing]).split("+"))
 
 
-def spec_of(settings: Any) -> MannequinSpec:
+def mannequin_spec(settings: Any) -> MannequinSpec:
     """The clip that the ingest stage's settings describe.
 
     ``settings.mannequin`` is the framing, and ``settings.mannequin_<field>`` any other field of the

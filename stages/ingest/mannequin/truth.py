@@ -1,4 +1,4 @@
-"""What is known of the mannequin and not told to the pipeline, and its files.
+"""The truth of a mannequin's clip, which the pipeline does not see, and its files.
 
 Written beside what ingest publishes:
 
@@ -41,9 +41,8 @@ from pipeline.body import (
 from pipeline.body.landmarks import join
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.files.tables import read_table, vectors, write_table
-from stages.ingest.mannequin.framing import inside
-from stages.ingest.mannequin.limbs import limbs_of_joints
-from stages.ingest.mannequin.scene import Picture
+from stages.ingest.mannequin.framing import in_picture
+from stages.ingest.mannequin.scene import FilmedFrame, limbs_of_joints
 
 OUTSIDE, HIDDEN, SEEN = 0, 1, 2
 """States of a point: not in the picture, behind something, or in view."""
@@ -88,8 +87,8 @@ class Truth:
 
 
 @dataclasses.dataclass(frozen=True)
-class Places:
-    """Where the body's joints and landmarks are: K = 55 joints, then the four sets of landmarks.
+class BodyPoints:
+    """The places of the body's joints and landmarks: K = 55 joints, then the four sets of landmarks.
 
     Attributes:
         world: [T, K, 3], metres.
@@ -104,8 +103,8 @@ class Places:
     sets: dict[str, slice]
 
 
-def find_places(body: BodyModel, landmarks: Landmarks, identity: Identity, poses: Poses) -> Places:
-    """Pose the joints and the few vertices that landmarks touch."""
+def pose_points(body: BodyModel, landmarks: Landmarks, identity: Identity, poses: Poses) -> BodyPoints:
+    """The posed joints and landmarks, by posing the few vertices that landmarks touch."""
     every = PointSet(
         torch.arange(55), torch.zeros(55, 3, dtype=torch.long), torch.tensor([[1.0, 0, 0]]).expand(55, 3)
     )
@@ -130,7 +129,7 @@ def find_places(body: BodyModel, landmarks: Landmarks, identity: Identity, poses
         name: slice(int(a), int(b))
         for name, a, b in zip(("joints", *names), starts, starts[1:], strict=False)
     }
-    return Places(world, thickness.numpy(), limbs_of_joints(points.joint), sets)
+    return BodyPoints(world, thickness.numpy(), limbs_of_joints(points.joint), sets)
 
 
 def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,17 +144,12 @@ def _posed(part: BodyModel, joints: Tensor, poses: Poses, rows: Tensor) -> tuple
     return posed_joints(rotation, joints, part.parents) + shift, vertices + shift
 
 
-def states(camera: Camera, picture: Picture, places: Places, row: int) -> np.ndarray:
-    """Whether each joint and landmark is seen in one frame.
+def point_states(camera: Camera, picture: FilmedFrame, places: BodyPoints, row: int) -> np.ndarray:
+    """The state of each joint and landmark in one frame, [K] uint8: OUTSIDE, HIDDEN or SEEN.
 
     Args:
-        camera: the view.
-        picture: what it saw.
-        places: joints and landmarks.
-        row: the frame.
-
-    Returns:
-        [K] uint8, OUTSIDE, HIDDEN or SEEN.
+        camera, picture: the view and what it saw.
+        places, row: joints and landmarks, and the frame.
     """
     points = places.world[row]
     within, rows, columns, away = _samples(camera, picture.depth, points)
@@ -167,11 +161,10 @@ def states(camera: Camera, picture: Picture, places: Places, row: int) -> np.nda
 def seen_vertices(
     camera: Camera, depth: np.ndarray, vertices: Tensor, tolerance: float = _SURFACE_DEPTH
 ) -> np.ndarray:
-    """Which vertices [V, 3] are in view in one frame: [V] bool. For errors of the seen surface.
+    """True where vertices [V, 3] are in view in one frame, [V] bool.
 
     Args:
-        camera: the view.
-        depth: [h, w], metres, the same view at any resolution; infinite where there is nothing.
+        camera, depth: the view, and its depth [h, w] at any resolution, metres, infinite beside the body.
         vertices: metres, in the world.
         tolerance: how deep below what is seen a vertex may lie, metres; hair and clothes count.
     """
@@ -182,16 +175,16 @@ def seen_vertices(
 def _samples(
     camera: Camera, depth: np.ndarray, points: Tensor
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For points [K, 3]: whether they are in the picture, their rows and columns in ``depth``, their Z."""
+    """Of points [K, 3]: in the picture or not, their rows and columns in ``depth``, their Z; each [K]."""
     pixels = project(camera, points).double().numpy()
     away = to_camera(camera, points)[:, 2].numpy()
     scale = np.array([depth.shape[1] / camera.width, depth.shape[0] / camera.height])
     place = (np.clip(pixels, 0, [camera.width - 1e-6, camera.height - 1e-6]) * scale).astype(int)
-    return inside(camera, pixels) & (away > 0), place[:, 1], place[:, 0], away
+    return in_picture(camera, pixels) & (away > 0), place[:, 1], place[:, 0], away
 
 
 def write_truth(folder: Path, truth: Truth, body: BodyModel) -> None:
-    """Write the files that the module's text names."""
+    """Write the files that the module's docstring lists."""
     write_poses(folder / "truth_poses.parquet", truth.poses)
     write_identity(folder / "truth_identity.safetensors", truth.identity, body)
     write_identity(folder / "truth_surface.safetensors", truth.surface, body)

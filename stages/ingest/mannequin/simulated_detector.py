@@ -1,4 +1,4 @@
-"""Keypoint detectors with known errors: what an estimator would say of the mannequin.
+"""Simulated keypoint detectors, whose errors on the mannequin are known.
 
 ``mediapipe`` errs as MediaPipe 0.10.21 (holistic) was measured to, on pictures of mannequins in the three
 framings (against their truth: 4 clips of 60 frames in each, two people, 256 px; for hidden points 3 clips
@@ -38,14 +38,14 @@ from scipy.special import expit, ndtr
 
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND, Keypoints, empty_keypoints
-from stages.ingest.mannequin.framing import inside
+from stages.ingest.mannequin.framing import in_picture
 from stages.ingest.mannequin.spec import MannequinSpec
-from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, Places
+from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, BodyPoints
 
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """How one kind of point is detected; lengths in metres, standard deviations in each direction.
+    """The errors of one kind of point; metres, standard deviations in each direction.
 
     Attributes:
         seen: error of a seen point.
@@ -99,8 +99,8 @@ _FEW_FOUND, _FOUND = 0.22, 0.85  # of the frames in which a little or more of a 
 
 
 @dataclasses.dataclass(frozen=True)
-class _Set:
-    """One set of points as the detector sees it: T frames, K points.
+class _TruePoints:
+    """The true places and states of one set of points, T frames, K points.
 
     Attributes:
         camera: [T, K, 3], metres in the camera's frame of reference.
@@ -112,16 +112,18 @@ class _Set:
     pixels: np.ndarray
     state: np.ndarray
 
-    def __getitem__(self, columns: slice) -> _Set:
-        return _Set(self.camera[:, columns], self.pixels[:, columns], self.state[:, columns])
+    def __getitem__(self, columns: slice) -> _TruePoints:
+        return _TruePoints(self.camera[:, columns], self.pixels[:, columns], self.state[:, columns])
 
     @property
     def share_seen(self) -> np.ndarray:
-        """[T]."""
+        """The share of points in view, [T]."""
         return (self.state == SEEN).mean(1)
 
 
-def detect(spec: MannequinSpec, camera: Camera, places: Places, state: np.ndarray) -> Keypoints:
+def simulate_detections(
+    spec: MannequinSpec, camera: Camera, places: BodyPoints, state: np.ndarray
+) -> Keypoints:
     """The detections of the whole clip.
 
     Args:
@@ -132,7 +134,7 @@ def detect(spec: MannequinSpec, camera: Camera, places: Places, state: np.ndarra
     """
     detector = _Detector(spec, camera)
     whole, pose, hands, mesh = (
-        detector.look(places, state, name) for name in ("whole_body", "pose", "hands", "face_mesh")
+        detector.truth_of(places, state, name) for name in ("whole_body", "pose", "hands", "face_mesh")
     )
     found = empty_keypoints(np.arange(spec.frames))
     for side in (0, 1):
@@ -152,45 +154,41 @@ def detect(spec: MannequinSpec, camera: Camera, places: Places, state: np.ndarra
     found.whole_body[:, FACE] = face[..., [0, 1, 3]]
     found.whole_body[:, LEFT_HAND] = found.hands[:, 0][..., [0, 1, 3]]
     found.whole_body[:, RIGHT_HAND] = found.hands[:, 1][..., [0, 1, 3]]
-    if detector.in_picture:
+    if detector.keeps_inside:
         blank = empty_keypoints(found.frames)
         return dataclasses.replace(blank, whole_body=found.whole_body)
-    found.whole_body[~inside(camera, found.whole_body[..., :2])] = 0  # as the ingest stage writes them
+    found.whole_body[~in_picture(camera, found.whole_body[..., :2])] = 0  # as the ingest stage writes them
     return found
 
 
 class _Detector:
-    """The detector's state: its random draws.
-
-    Attributes:
-        in_picture: whether every point is put inside the picture.
-    """
+    """A detector with its random draws; with ``keeps_inside`` it puts every point inside the picture."""
 
     def __init__(self, spec: MannequinSpec, camera: Camera) -> None:
         self.spec, self.camera = spec, camera
-        self.in_picture = spec.detector == "heatmap"
+        self.keeps_inside = spec.detector == "heatmap"
         self.size = np.array([camera.width, camera.height], float)
         self.focal = float(camera.intrinsics[0, 0])
         self.rng = np.random.default_rng([spec.seed, 7])
         self.too_short = self.rng.standard_normal()  # a guessed body is too short as a whole
 
-    def look(self, places: Places, state: np.ndarray, name: str) -> _Set:
+    def truth_of(self, places: BodyPoints, state: np.ndarray, name: str) -> _TruePoints:
         """The points of one set in the camera."""
         rows = places.sets[name]
         world = places.world[:, rows]
-        return _Set(
+        return _TruePoints(
             to_camera(self.camera, world).double().numpy(),
             project(self.camera, world).double().numpy(),
             state[:, rows],
         )
 
-    def as_a_whole(self, truth: _Set) -> _Set:
+    def as_a_whole(self, truth: _TruePoints) -> _TruePoints:
         """A hand or face as a model of its own sees it: found with its points outside, or not at all."""
-        if self.in_picture:
+        if self.keeps_inside:
             return truth
         return dataclasses.replace(truth, state=np.maximum(truth.state, HIDDEN))
 
-    def points(self, truth: _Set, parts: tuple[_Part, ...]) -> np.ndarray:
+    def points(self, truth: _TruePoints, parts: tuple[_Part, ...]) -> np.ndarray:
         """Detections [T, K, 4] float32: x, y, z in pixels, z about the set's middle, and a score.
 
         Args:
@@ -202,7 +200,7 @@ class _Detector:
         outside = (truth.state == OUTSIDE)[..., None]
         off = np.where(outside, self._guessed(away, parts), self._found(truth, parts))
         xy = truth.pixels + off * per_metre[..., None]
-        if self.in_picture:
+        if self.keeps_inside:
             seen = (truth.state == SEEN)[..., None]
             xy = np.where(seen, np.clip(xy, 0, self.size), self._pulled_in(xy))
         depth = truth.camera[..., 2] - truth.camera[..., 2].mean(1, keepdims=True)
@@ -211,7 +209,7 @@ class _Detector:
         score = self._scores(truth.state, np.linalg.norm(away, axis=-1), parts)
         return np.concatenate([xy, z[..., None], score[..., None]], axis=-1).astype(np.float32)
 
-    def world(self, pose: _Set, found: np.ndarray) -> np.ndarray:
+    def world(self, pose: _TruePoints, found: np.ndarray) -> np.ndarray:
         """The 33 points in metres about the hips, [T, 33, 4]; a guess is as wrong as in the picture.
 
         Args:
@@ -228,7 +226,7 @@ class _Detector:
         places = (places - places[:, 23:25].mean(1, keepdims=True)) * scale
         return np.concatenate([places, found[..., 3:]], axis=-1).astype(np.float32)
 
-    def misses_hand(self, hand: _Set) -> np.ndarray:
+    def misses_hand(self, hand: _TruePoints) -> np.ndarray:
         """In which frames a hand is not found, [T] bool."""
         share = hand.share_seen
         chance = np.where(share >= _FEW_OF_HAND, _FOUND, np.where(share > 0, _FEW_FOUND, 0.0))
@@ -239,11 +237,11 @@ class _Detector:
 
         A detector that has to return something somewhere scores it low; the other returns nothing.
         """
-        if self.in_picture:
+        if self.keeps_inside:
             points[missed, :, 3] = np.minimum(points[missed, :, 3], 0.2)
         else:
             points[missed] = 0
-            points[~inside(self.camera, points[..., :2])] = 0
+            points[~in_picture(self.camera, points[..., :2])] = 0
 
     def fail_hands(self, hands: np.ndarray) -> None:
         """Spoil some hands [T, 2, 21, 4], in place, for one to three frames each."""
@@ -265,17 +263,17 @@ class _Detector:
                 exists = (own[..., 3:] > 0) & ((other[..., 3:] > 0) if jumps else True)
                 hands[rows, side] = np.where(exists, failed, own)
 
-    def _per_metre(self, truth: _Set) -> np.ndarray:
+    def _per_metre(self, truth: _TruePoints) -> np.ndarray:
         """Pixels of a metre at each point, [T, K]."""
         return self.focal / np.maximum(truth.camera[..., 2], 0.1)
 
-    def _outside(self, truth: _Set) -> np.ndarray:
+    def _outside(self, truth: _TruePoints) -> np.ndarray:
         """The way from each point to the picture, [T, K, 2] metres; zero for what is inside."""
         nearest = np.clip(truth.pixels, 0, self.size)
         return (nearest - truth.pixels) / self._per_metre(truth)[..., None]
 
-    def _found(self, truth: _Set, parts: tuple[_Part, ...]) -> np.ndarray:
-        """How far off points inside the picture are, [T, K, 2] metres."""
+    def _found(self, truth: _TruePoints, parts: tuple[_Part, ...]) -> np.ndarray:
+        """The error of points inside the picture, [T, K, 2] metres."""
         floor = _FLOOR / self._per_metre(truth)
         seen = self.spec.noise * (floor + np.array([part.seen for part in parts]))
         hidden = np.array([part.hidden for part in parts]) + floor
@@ -283,7 +281,7 @@ class _Detector:
         return self._drifting(truth.pixels.shape) * sigma[..., None]
 
     def _guessed(self, away: np.ndarray, parts: tuple[_Part, ...]) -> np.ndarray:
-        """How far off points outside the picture are, [T, K, 2] metres: most of it for the whole clip."""
+        """The error of points outside the picture, [T, K, 2] metres, most of it the same in all frames."""
         distance = np.linalg.norm(away, axis=-1, keepdims=True)
         share, aside = (np.array([getattr(part, name) for part in parts]) for name in ("share", "aside"))
         own = self.rng.standard_normal((2, len(parts), 2))
@@ -320,5 +318,5 @@ class _Detector:
 
 
 def _parts(name: str) -> tuple[_Part, ...]:
-    """What each point of an order is."""
+    """The kind of each point of a set, in order."""
     return tuple(_PARTS[kind] for kind, count in _ORDERS[name] for _ in range(count))

@@ -1,4 +1,4 @@
-"""Masks that agree from frame to frame."""
+"""Masks smoothed over time along the optical flow."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 AGREEMENT = 8.0  # grey levels; where pictures differ by more, their masks have little to say to each other
 
 
-def steady(pairs: Iterable[tuple[np.ndarray, np.ndarray]], reach: int) -> Iterator[np.ndarray]:
+def smooth_masks(pairs: Iterable[tuple[np.ndarray, np.ndarray]], reach: int) -> Iterator[np.ndarray]:
     """Masks averaged with their neighbours in time, moved along the optical flow.
 
     Args:
@@ -40,19 +40,15 @@ def _average(window: list[tuple[np.ndarray, np.ndarray]], row: int, reach: int) 
     for other in range(max(0, row - reach), min(len(window), row + reach + 1)):
         if other == row:
             continue
-        moved, trust = _carry(grey, *window[other])
+        moved, trust = _warp(grey, *window[other])
         weight = trust / (1 + abs(other - row))
         total += weight * moved
         weights += weight
     return total / weights
 
 
-def _carry(
-    grey: np.ndarray,
-    other_grey: np.ndarray,
-    other_alpha: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Another frame's mask as seen in this one, and how well the pictures agree there, both [H, W]."""
+def _warp(grey: np.ndarray, other_grey: np.ndarray, other_alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Another frame's mask warped to this one, and how well the pictures agree there, both [H, W]."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(grey, other_grey, None)  # type: ignore[call-overload]
     y, x = np.mgrid[0 : grey.shape[0], 0 : grey.shape[1]].astype(np.float32)
     where = (x + flow[..., 0], y + flow[..., 1])

@@ -1,4 +1,4 @@
-"""From a calibrated lens to the pinhole of the stored frames, and the distortion taken out of them."""
+"""The lens of the stored frames, its distortion, and frames and points without it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pycolmap
 
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints
-from pipeline.detection.wholebody import inside
+from pipeline.detection.wholebody import inside_picture
 from pipeline.errors import UserError
 from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
 from stages.ingest.video import Clip
@@ -23,14 +23,15 @@ LEFT_ALONE = 1.0  # pixels of the stored frame; resampling would cost more than 
 GRID = 33  # points a side at which distortion is measured
 
 
-def stored_view(view: CalibratedCamera, clip: Clip, width: int, height: int, path: Path) -> CalibratedCamera:
-    """A view with the lens of the stored frames: turned as the clip's frames were, and scaled.
+def for_stored_frames(
+    view: CalibratedCamera, clip: Clip, width: int, height: int, path: Path
+) -> CalibratedCamera:
+    """A calibrated view with the lens of the stored frames [height, width]: turned as they were, and scaled.
 
     Args:
-        view: as calibrated.
+        view, path: as calibrated, and its file for messages.
         clip: the footage, upright.
         width, height: of the stored frames, pixels.
-        path: the calibration, for messages.
 
     Raises:
         UserError: the calibration is of pictures with other proportions.
@@ -49,32 +50,30 @@ def stored_view(view: CalibratedCamera, clip: Clip, width: int, height: int, pat
     return dataclasses.replace(view, lens=scaled)
 
 
-def pinhole_of(lens: pycolmap.Camera) -> pycolmap.Camera:
+def without_distortion(lens: pycolmap.Camera) -> pycolmap.Camera:
     """The lens without its distortion: the same focal lengths and centre."""
     focal = (lens.focal_length_x, lens.focal_length_y)
     return pinhole_lens(lens.width, lens.height, focal, (lens.principal_point_x, lens.principal_point_y))
 
 
-def distortion(lens: pycolmap.Camera) -> float:
-    """How far a lens shows points from where its pinhole would, at most within the picture, pixels."""
+def distortion_pixels(lens: pycolmap.Camera) -> float:
+    """The largest distance within the picture between a point and where a pinhole would show it, pixels."""
     if lens.is_undistorted():
         return 0.0
     x, y = np.meshgrid(np.linspace(0, lens.width, GRID), np.linspace(0, lens.height, GRID))
     there = np.stack([x, y], axis=-1).reshape(-1, 2)
-    moved = straightened(lens, there) - there
+    moved = undistort_points(lens, there) - there
     return float(np.nanmax(np.linalg.norm(moved, axis=1))) if np.isfinite(moved).any() else float("inf")
 
 
-def straightened(lens: pycolmap.Camera, points: np.ndarray) -> np.ndarray:
+def undistort_points(lens: pycolmap.Camera, points: np.ndarray) -> np.ndarray:
     """Pixels of the lens as pixels of its pinhole, [N, 2] -> [N, 2]; NaN where the lens maps no ray there."""
     rays = np.asarray(lens.cam_from_img(points.astype(np.float64)))
-    return rays * [lens.focal_length_x, lens.focal_length_y] + [
-        lens.principal_point_x,
-        lens.principal_point_y,
-    ]
+    centre = [lens.principal_point_x, lens.principal_point_y]
+    return rays * [lens.focal_length_x, lens.focal_length_y] + centre
 
 
-def undistort(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Keypoints) -> Keypoints:
+def undistort_frames(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Keypoints) -> Keypoints:
     """Take the distortion out of the stored frames and masks, in place, and out of the keypoints.
 
     Args:
@@ -86,9 +85,8 @@ def undistort(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Ke
         The keypoints of the straightened frames; points that left the picture have lost their scores.
     """
     maps = functools.cache(_maps)
-    fields = {
-        name: getattr(keypoints, name).copy() for name in ("whole_body", "face_mesh", "pose_image", "hands")
-    }
+    names = ("whole_body", "face_mesh", "pose_image", "hands")
+    fields = {name: getattr(keypoints, name).copy() for name in names}
     for row, frame in enumerate(keypoints.frames.tolist()):
         lens = lenses.get(frame)
         if lens is None:
@@ -96,9 +94,8 @@ def undistort(output: Path, lenses: Mapping[int, pycolmap.Camera], keypoints: Ke
         where = maps(lens.width, lens.height, lens.model_name, tuple(lens.params))
         image = cv2.remap(read_frame(output / "frames", frame), *where, cv2.INTER_CUBIC)
         write_frame(output / "frames", frame, image)
-        write_mask(
-            output / "masks", frame, cv2.remap(read_mask(output / "masks", frame), *where, cv2.INTER_LINEAR)
-        )
+        mask = cv2.remap(read_mask(output / "masks", frame), *where, cv2.INTER_LINEAR)
+        write_mask(output / "masks", frame, mask)
         for name, points in fields.items():
             _straighten(points[row], lens, keeps_outside=name == "pose_image")
     return dataclasses.replace(keypoints, **fields)
@@ -108,15 +105,15 @@ def _straighten(points: np.ndarray, lens: pycolmap.Camera, keeps_outside: bool) 
     """Points [..., K] of x, y, ..., score, changed in place; what was not found, all zero, stays so."""
     flat = points.reshape(-1, points.shape[-1])
     found = flat[:, -1] > 0
-    flat[found, :2] = straightened(lens, flat[found, :2])
+    flat[found, :2] = undistort_points(lens, flat[found, :2])
     lost = found & ~np.isfinite(flat).all(1)
     if not keeps_outside:
-        lost |= found & (inside(flat, np.array([lens.width, lens.height])) == 0)
+        lost |= found & (inside_picture(flat, np.array([lens.width, lens.height])) == 0)
     flat[lost] = 0
 
 
 def _maps(width: int, height: int, model: str, params: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of the pinhole's picture lies in the lens's, for ``cv2.remap``."""
+    """The place in the lens's picture of each pixel of the pinhole's, for ``cv2.remap``, two [H, W]."""
     lens = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     across = (x - lens.principal_point_x) / lens.focal_length_x
@@ -143,6 +140,5 @@ def _turned(view: CalibratedCamera, turns: int, path: Path) -> CalibratedCamera:
     centre = (y, width - x) if turns % 4 == 1 else (height - y, x)
     sign = 1.0 if turns % 4 == 1 else -1.0
     turn = np.array([[0, sign, 0], [-sign, 0, 0], [0, 0, 1.0]])
-    return CalibratedCamera(
-        pinhole_lens(height, width, (fy, fx), centre), turn @ view.rotation, turn @ view.translation
-    )
+    lens = pinhole_lens(height, width, (fy, fx), centre)
+    return CalibratedCamera(lens, turn @ view.rotation, turn @ view.translation)

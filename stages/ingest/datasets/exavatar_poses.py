@@ -31,7 +31,7 @@ from stages.ingest.datasets.recording import entry, numbers
 _REMEDY = "prepare the folder again, or take smplx_optimized out of it"
 
 
-def prepared_poses(folder: Path, smoothed: bool) -> InitialPoses | None:
+def read_exavatar_poses(folder: Path, smoothed: bool) -> InitialPoses | None:
     """The best poses that a prepared folder has; None where it has none.
 
     Args:

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.ingest.cameras.motion import FEWEST, GAP_SECONDS, PAIRS, follow
+from stages.ingest.cameras.background_motion import FEWEST, GAP_SECONDS, PAIRS, track_corners
 
 ROUNDS = 5
 OUTLIER = 3.0  # times the median error
 NEVER_WORSE = 0.5  # pixels; corners that agree this well are never outliers
-ONLY_TURNS = 0.03
+ROTATION_ONLY = 0.03
 """Part of the displacement that a camera which only turns may leave unexplained. Pans that were made for the
 tests left 0.011 under a focal length wrong by 40%, slides and orbits 0.043 to 0.22, a selfie 0.15."""
-MOSTLY_TURNS = 0.05  # and one whose turns are better than nothing, where structure from motion has failed
+MOSTLY_ROTATION = 0.05  # and one whose turns are better than nothing, where structure from motion has failed
 
 
-def turn_between(before: np.ndarray, after: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, float]:
+def rotation_between(before: np.ndarray, after: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, float]:
     """The rotation between two frames of a camera that only turned.
 
     Args:
@@ -44,7 +44,7 @@ def turn_between(before: np.ndarray, after: np.ndarray, matrix: np.ndarray) -> t
     return rotation, float(np.median(error))
 
 
-def unexplained_by_turns(output: Path, frames: Sequence[int], fps: float, matrix: np.ndarray) -> float:
+def unexplained_by_rotation(output: Path, frames: Sequence[int], fps: float, matrix: np.ndarray) -> float:
     """The part of the background's displacement that rotations leave unexplained.
 
     Measured over pairs of frames up to a second apart, medians; half a pixel is what following costs.
@@ -63,9 +63,9 @@ def unexplained_by_turns(output: Path, frames: Sequence[int], fps: float, matrix
     unexplained, distances = [], []
     for start in starts:
         for step in (gap, gap // 2, gap // 4):
-            before, after = follow(output, frames[start], frames[start + max(1, step)])
+            before, after = track_corners(output, frames[start], frames[start + max(1, step)])
             if len(before) >= FEWEST:
-                unexplained.append(turn_between(before, after, matrix)[1])
+                unexplained.append(rotation_between(before, after, matrix)[1])
                 distances.append(float(np.median(np.linalg.norm(after - before, axis=1))))
                 break
     if not distances:
@@ -74,7 +74,7 @@ def unexplained_by_turns(output: Path, frames: Sequence[int], fps: float, matrix
     return left / max(float(np.median(distances)), NEVER_WORSE)
 
 
-def chain_turns(output: Path, frames: Sequence[int], matrix: np.ndarray) -> list[np.ndarray] | None:
+def chain_rotations(output: Path, frames: Sequence[int], matrix: np.ndarray) -> list[np.ndarray] | None:
     """World-to-camera rotations of all frames, the first camera's axes being the world's.
 
     Args:
@@ -87,10 +87,10 @@ def chain_turns(output: Path, frames: Sequence[int], matrix: np.ndarray) -> list
     """
     rotations = [np.eye(3)]
     for first, second in zip(frames[:-1], frames[1:], strict=True):
-        before, after = follow(output, first, second)
+        before, after = track_corners(output, first, second)
         if len(before) < FEWEST:
             return None
-        rotations.append(turn_between(before, after, matrix)[0] @ rotations[-1])
+        rotations.append(rotation_between(before, after, matrix)[0] @ rotations[-1])
     return rotations
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pycolmap
 
 from pipeline.clip.frames import read_mask, spread_end_to_end, write_mask
+from stages.ingest.cameras.background_motion import background_mask
 from stages.ingest.cameras.calibration import Calibration
-from stages.ingest.cameras.colmap import model_views
-from stages.ingest.cameras.motion import person_free
+from stages.ingest.cameras.calibration_files import model_views
 
 MOST_FRAMES = 200  # that are mapped, evenly spread; the others lie between them
 FEATURES = 2048
@@ -24,9 +24,9 @@ OVERLAP = 8  # neighbours on either side that a frame is matched with, and the 2
 REGISTERED = 0.6  # part of the mapped frames that must find a camera for the model to be believed
 FOCAL_RANGE = (0.6, 1.8)  # of the initial focal length that the refined one may be
 ATTEMPTS = ((16.0, 100, True), (4.0, 50, True), (4.0, 50, False))
-"""What the pair that COLMAP begins with must have, in turn: degrees at which rays cross, points, and whether
-the focal length is refined. Its own demands, the first, mean photographs from all around; people are filmed
-from one side. (It halves both by itself where it finds no pair.)"""
+"""Demands on the pair that COLMAP begins with, tried in turn: degrees at which rays cross, points, and if
+the focal length is refined. COLMAP's own, the first, suit photographs from all around; people are filmed from
+one side. (It halves both by itself where it finds no pair.)"""
 LEAST_ANGLE = 1.0  # degrees; where the rays of points cross at less, a median over them, there is no baseline
 
 
@@ -48,7 +48,7 @@ def structure_from_motion(
         centre: principal point, pixels.
 
     Returns:
-        The cameras under their frames' file names; or in words why there are none.
+        The cameras under their frames' file names; or the reason why there are none.
     """
     names = [f"{frame:06d}.png" for frame in mapped_frames(frames)]
     shutil.rmtree(work, ignore_errors=True)
@@ -72,7 +72,7 @@ def structure_from_motion(
 def _write_masks(output: Path, folder: Path, frames: Sequence[int]) -> None:
     """COLMAP looks for NAME.png beside the picture NAME and leaves out its black pixels."""
     for frame in frames:
-        write_mask(folder, frame, person_free(read_mask(output / "masks", frame)))
+        write_mask(folder, frame, background_mask(read_mask(output / "masks", frame)))
         (folder / f"{frame:06d}.png").rename(folder / f"{frame:06d}.png.png")
 
 
@@ -105,23 +105,13 @@ def _match(output: Path, work: Path, names: list[str], focal: float, centre: tup
 
 def _options(angle: float, points: int, refine: bool) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions(
-        num_threads=1,
-        random_seed=0,
-        multiple_models=False,
-        extract_colors=False,
-        min_model_size=3,
-        ba_refine_focal_length=refine,
-        ba_refine_principal_point=False,
-    )
-    mapper = {
-        "init_min_tri_angle": angle,
-        "init_min_num_inliers": points,
-        "abs_pose_refine_focal_length": refine,
-        "random_seed": 0,
-        "num_threads": 1,
-    }
-    for name, value in mapper.items():
-        setattr(options.mapper, name, value)
+        num_threads=1, random_seed=0, multiple_models=False, extract_colors=False, min_model_size=3,
+        ba_refine_focal_length=refine, ba_refine_principal_point=False,
+    )  # fmt: skip
+    mapper = options.mapper
+    mapper.init_min_tri_angle, mapper.init_min_num_inliers = angle, points
+    mapper.abs_pose_refine_focal_length = refine
+    mapper.random_seed, mapper.num_threads = 0, 1
     options.triangulation.random_seed = 0
     return options
 

@@ -1,4 +1,4 @@
-"""Whether the camera moves: how far the background does, measured by sparse optical flow.
+"""The background's motion by sparse optical flow, which tells whether the camera moves.
 
 Corners outside the widened mask are followed from one frame to another (pyramidal Lucas-Kanade, each
 checked by following it back). Their median displacement over the picture's longer side is robust to what
@@ -35,7 +35,7 @@ AT = 75  # percentile of the pairs that is compared with MOVING: a clip may stan
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class BackgroundMotion:
     """The background's motion.
 
     Attributes:
@@ -51,7 +51,7 @@ class Motion:
 
     @property
     def moving(self) -> bool:
-        """Whether the camera has to be taken for moving; a background that cannot tell stands still."""
+        """True where the camera counts as moving; False where the background cannot tell."""
         return self.displacement >= MOVING
 
     def __str__(self) -> str:
@@ -64,7 +64,7 @@ class Motion:
         )
 
 
-def measure_motion(output: Path, frames: Sequence[int], fps: float) -> Motion:
+def measure_motion(output: Path, frames: Sequence[int], fps: float) -> BackgroundMotion:
     """Measure the background's motion over a clip.
 
     Args:
@@ -78,7 +78,7 @@ def measure_motion(output: Path, frames: Sequence[int], fps: float) -> Motion:
     for start in starts if len(frames) > 1 else ():
         gap = widest
         while gap >= 1:
-            before, after = follow(output, frames[start], frames[start + gap])
+            before, after = track_corners(output, frames[start], frames[start + gap])
             if len(before) >= FEWEST or gap == 1:
                 break
             gap //= 2
@@ -86,14 +86,14 @@ def measure_motion(output: Path, frames: Sequence[int], fps: float) -> Motion:
             displacements.append(float(np.median(np.linalg.norm(after - before, axis=1))))
             gaps.append(gap)
     if not displacements:
-        return Motion(float("nan"), 0, 0.0)
+        return BackgroundMotion(float("nan"), 0, 0.0)
     longer = max(read_mask(output / "masks", frames[0]).shape)
     moved = float(np.percentile(displacements, AT)) / longer
-    return Motion(moved, len(displacements), float(np.median(gaps)))
+    return BackgroundMotion(moved, len(displacements), float(np.median(gaps)))
 
 
-def follow(output: Path, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
-    """Background corners of one frame in another.
+def track_corners(output: Path, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the background in one frame, and where they are in another.
 
     Args:
         output: the folder with ``frames`` and ``masks``.
@@ -114,13 +114,13 @@ def follow(output: Path, first: int, second: int) -> tuple[np.ndarray, np.ndarra
     before, after = corners[:, 0], there[:, 0]
     kept = (found[:, 0] > 0) & (found_back[:, 0] > 0)
     kept &= np.linalg.norm(back[:, 0] - before, axis=1) < RETURN
-    kept &= _free_at(other_free, after)
+    kept &= _on_background(other_free, after)
     if kept.sum() < SURVIVING * len(before):
         return nothing, nothing
     return before[kept] + 0.5, after[kept] + 0.5
 
 
-def person_free(mask: np.ndarray) -> np.ndarray:
+def background_mask(mask: np.ndarray) -> np.ndarray:
     """[H, W] uint8, 255 where the person, widened, is not."""
     reach = 2 * max(1, round(MARGIN * max(mask.shape))) + 1
     person = cv2.dilate((mask >= PERSON).astype(np.uint8), np.ones((reach, reach), np.uint8))
@@ -130,11 +130,11 @@ def person_free(mask: np.ndarray) -> np.ndarray:
 def _background(output: Path, frame: int) -> tuple[np.ndarray, np.ndarray]:
     """A frame in grey, and where the background is, both [H, W] uint8."""
     grey = cv2.cvtColor(read_frame(output / "frames", frame), cv2.COLOR_RGB2GRAY)
-    return grey, person_free(read_mask(output / "masks", frame))
+    return grey, background_mask(read_mask(output / "masks", frame))
 
 
-def _free_at(free: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points [N, 2] lie in the picture and on its background, [N] bool."""
+def _on_background(free: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """True where points [N, 2] lie in the picture and on its background, [N] bool."""
     pixels = np.floor(points + 0.5).astype(int)
     within = ((pixels >= 0) & (pixels < free.shape[::-1])).all(1)
     pixels = np.clip(pixels, 0, np.array(free.shape[::-1]) - 1)

@@ -1,4 +1,4 @@
-"""A mask's edge drawn to where the colours change.
+"""A mask's edge moved to where the colours change.
 
 About each uncertain pixel, colour is regressed on the mask over a small box in which certain pixels
 count most (a guided filter with weights); where the colours there tell the two sides apart, the
@@ -18,7 +18,7 @@ SOFTNESS = 0.8  # pixels, the blur that makes the edge smooth again
 
 
 def follow_edges(alpha: np.ndarray, image: np.ndarray, strength: float) -> np.ndarray:
-    """The mask with its edge at the picture's edges, [H, W] float32 in [0, 1].
+    """The mask with its edge moved to where the colours change, [H, W] float32 in [0, 1].
 
     Args:
         alpha: [H, W] in [0, 1].
