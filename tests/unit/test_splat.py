@@ -203,7 +203,8 @@ def test_kernels_are_compiled_once_for_all_processes():
         "from tests.unit.splat_scene import draw, scene\n"
         "from pipeline.splat import blending, projection, tiles\n"
         "draw(*scene(3, 8, 8, torch.float32), 'numba')\n"
-        "kernels = (blending.blend_forward, blending.blend_backward, blending.sum_weights, projection.project_forward,\n"
+        "kernels = (blending.blend_forward, blending.blend_backward, blending.sum_weights,\n"
+        "           projection.project_forward,\n"
         "           projection.project_backward, tiles.bin_gaussians)\n"
         "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
     )
