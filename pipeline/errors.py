@@ -34,6 +34,11 @@ def error_message(error: BaseException, where: Path) -> str | None:
     Args:
         error: what stopped a stage.
         where: the folder that it was writing to, for errors that name no file.
+
+    >>> error_message(UserError("clip.mp4 is missing: check source="), Path("."))
+    'clip.mp4 is missing: check source='
+    >>> error_message(ZeroDivisionError(), Path(".")) is None
+    True
     """
     if isinstance(error, UserError):
         return str(error)

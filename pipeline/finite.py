@@ -41,6 +41,11 @@ def require_finite(tensors: Mapping[str, Tensor], who: str, where: str, remedy: 
 
     Raises:
         NotFiniteError: names the first tensor that holds one.
+
+    >>> import torch
+    >>> require_finite({"loss": torch.tensor(torch.nan)}, "training", "at iteration 3", "lower the rate")
+    Traceback (most recent call last):
+    pipeline.finite.NotFiniteError: training stopped: loss is not finite at iteration 3 (1 of 1 numbers, ...
     """
     if finite(tensors.values()):
         return

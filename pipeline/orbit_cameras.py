@@ -40,6 +40,9 @@ def relaxed_pose(arm_angle: float) -> Tensor:
     """The A pose: the T pose with both arms ``arm_angle`` radians down at the shoulders, [55, 3].
 
     The subject's left is +X, so its left arm comes down by a turn about -Z and its right about +Z.
+
+    >>> relaxed_pose(0.5)[JOINT_NAMES.index("left_shoulder")]
+    tensor([ 0.0000,  0.0000, -0.5000])
     """
     rotation = torch.zeros(len(JOINT_NAMES), 3)
     rotation[JOINT_NAMES.index("left_shoulder"), 2] = -arm_angle

@@ -68,6 +68,9 @@ def contact_sheet(
         labels: a line above each picture; none if None.
         paper: value of the pixels where no picture is.
         gap: pixels to the right of each picture and below it.
+
+    >>> contact_sheet([np.zeros((20, 30, 3), np.uint8)] * 5, columns=3).shape
+    (40, 90, 3)
     """
     cells = list(pictures)
     if labels is not None:

@@ -79,6 +79,12 @@ def otsu_threshold(counts: np.ndarray) -> tuple[float, float, float]:
     Returns:
         tau*, the separability eta in [0, 1] and the mean mu_0 of the lower class; 0, 0, 0 where all
         scores lie in one bin.
+
+    Seven vertices that are seen in a tenth of the frames, and three that nearly always are:
+
+    >>> tau, separability, low_mean = otsu_threshold(histogram(np.array([0.1] * 7 + [0.9] * 3)))
+    >>> round(tau, 2), round(separability, 2), round(low_mean, 2)
+    (0.5, 1.0, 0.1)
     """
     share = counts / counts.sum()
     centres = (np.arange(len(counts)) + 0.5) / len(counts)
@@ -101,6 +107,12 @@ def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -
     Args:
         scores: [V] in [0, 1], of every vertex of the body.
         largest_loss: see there.
+
+    >>> scores = np.array([0.0] * 40 + [0.95] * 60)
+    >>> evidence_threshold(scores).why
+    '40% of the body is under 0.48, and 0.00% of what is seen goes with it'
+    >>> evidence_threshold(np.linspace(0, 1, 100)).closed  # no valley: nothing is gated
+    False
     """
     tau, separability, low_mean = otsu_threshold(histogram(scores))
     first = tau

@@ -99,6 +99,9 @@ def encode(values: Tensor, frequencies: int) -> Tensor:
 
     Returns:
         [..., D (1 + 2 L)].
+
+    >>> encode(torch.tensor([0.5]), 1)  # the value, sin(pi / 2), cos(pi / 2)
+    tensor([ 5.0000e-01,  1.0000e+00, -4.3711e-08])
     """
     octaves = 2.0 ** torch.arange(frequencies, dtype=values.dtype, device=values.device)
     angles = values[..., None] * (math.pi * octaves)

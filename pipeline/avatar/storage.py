@@ -67,6 +67,16 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
 
     Raises:
         UserError: if the file is no avatar, is damaged, or belongs to another body model.
+
+    An avatar in the rest pose, from a file in ``avatar_file``:
+
+    >>> from pathlib import Path
+    >>> from pipeline.body import Pose, load_body
+    >>> avatar = load_avatar(avatar_file, load_body(Path("data/body/open_body.npz")))
+    >>> rest = Pose(rotation=torch.zeros(55, 3), expression=torch.zeros(10), transl=torch.zeros(3))
+    >>> gaussians = avatar.gaussians(rest)
+    >>> len(gaussians) == len(avatar)
+    True
     """
     header, tensors = _read(path)
     if header.get("format") != FORMAT:

@@ -92,6 +92,10 @@ def load_body(path: Path) -> BodyModel:
     Raises:
         UserError: the file is missing, is no npz, lacks an array, or an array has an impossible
             shape or value.
+
+    >>> body = load_body(Path("data/body/open_body.npz"))
+    >>> body.v_template.shape, body.skinning_weights.shape
+    (torch.Size([13524, 3]), torch.Size([13524, 55]))
     """
     path = Path(path)
     try:

@@ -31,6 +31,9 @@ def joint_index(name: str) -> int:
 
     Raises:
         KeyError: there is no joint of that name.
+
+    >>> joint_index("left_wrist")
+    20
     """
     return _INDEX[name]
 

@@ -25,6 +25,10 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
     Returns:
         [..., V, 3]; zero at a vertex that no face, or only faces without area, contains.
+
+    >>> triangle = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> vertex_normals(triangle, torch.tensor([[0, 1, 2]]))[0]
+    tensor([0., 0., 1.])
     """
     normals = face_normals(vertices, faces)
     summed = torch.zeros_like(vertices)
@@ -86,6 +90,10 @@ def subdivide(faces: Tensor, *attributes: Tensor, levels: int = 1) -> tuple[Tens
 
     Returns:
         faces [F * 4^levels, 3] and the attributes, in order.
+
+    >>> faces, (vertices,) = subdivide(torch.tensor([[0, 1, 2]]), torch.eye(3))
+    >>> len(faces), vertices[3:].tolist()
+    (4, [[0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]])
     """
     if any(not attribute.is_floating_point() for attribute in attributes):
         raise TypeError("only floating-point attributes have a midpoint")

@@ -54,6 +54,13 @@ class Poses:
         transl: [T, 3], metres, added to the posed body.
         valid: [T] bool, whether the frame's pose was measured: at least one keypoint of it was
             trusted. The pose of any other frame is interpolated. All True if not given.
+
+    >>> transl = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
+    >>> poses = Poses((0, 2), torch.zeros(2, 55, 3), torch.zeros(2, 10), transl)
+    >>> poses.pose(2).transl
+    tensor([0., 0., 2.])
+    >>> poses.select([2]).frames
+    (2,)
     """
 
     frames: tuple[int, ...]

@@ -52,6 +52,12 @@ def rasterize(camera: Camera, vertices: Tensor, faces: Tensor) -> Raster:
         camera: the view.
         vertices: [V, 3], metres, in the world.
         faces: [F, 3] int64.
+
+    >>> from pipeline.clip.camera import facing_camera
+    >>> triangle = torch.tensor([[-1.0, -1, -2], [1, -1, -2], [0, 1, -2]])
+    >>> raster = rasterize(facing_camera(8, 8, focal=8.0), triangle, torch.tensor([[0, 1, 2]]))
+    >>> bool(raster.covered[4, 4]), float(raster.depth[4, 4])
+    (True, 2.0)
     """
     with torch.no_grad():
         pixels = project(camera, vertices).cpu().numpy().astype(np.float32)

@@ -80,6 +80,13 @@ def linear_blend_skinning(
 
     Returns:
         [T, N, 3], metres, without ``transl``.
+
+    A point halfway between a joint that rests and one that moves by a metre moves by half a metre:
+
+    >>> rest = torch.eye(3, 4)
+    >>> moved = rest + torch.tensor([[0.0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]])
+    >>> linear_blend_skinning(torch.stack([rest, moved])[None], torch.tensor([[0.5, 0.5]]), torch.zeros(1, 3))
+    tensor([[[0.5000, 0.0000, 0.0000]]])
     """
     return transform_points(blend_transforms(transforms, weights), points)
 
@@ -158,7 +165,18 @@ def pose_frame(body: BodyModel, identity: Identity, pose: Pose) -> tuple[Tensor,
 
 
 def posed_vertices(body: BodyModel, identity: Identity, pose: Pose) -> Tensor:
-    """The mesh in one frame: [V, 3], metres, in the world."""
+    """The mesh in one frame: [V, 3], metres, in the world.
+
+    A metre up, in the rest pose:
+
+    >>> from pathlib import Path
+    >>> from pipeline.body import load_body, mean_identity
+    >>> body = load_body(Path("data/body/open_body.npz"))
+    >>> pose = Pose(rotation=torch.zeros(55, 3), expression=torch.zeros(10), transl=torch.tensor([0.0, 1, 0]))
+    >>> vertices = posed_vertices(body, mean_identity(body), pose)
+    >>> torch.allclose(vertices, body.v_template + pose.transl, atol=1e-5)
+    True
+    """
     return pose_frame(body, identity, pose)[0]
 
 

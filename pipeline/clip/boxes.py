@@ -64,6 +64,11 @@ def person_box(
         margin: pixels around the person.
         faintest: the alpha from which a pixel is the person's, of 255.
         smallest: pixels along each side of the box; the picture must have as many.
+
+    >>> mask = np.zeros((100, 80), np.uint8)
+    >>> mask[40:60, 30:50] = 255
+    >>> person_box([mask], margin=5)
+    Box(left=25, top=35, right=55, bottom=65)
     """
     columns, rows = np.zeros(0, bool), np.zeros(0, bool)
     for mask in masks:

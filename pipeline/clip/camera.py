@@ -91,6 +91,10 @@ def project(camera: Camera, points: Tensor, nearest: float = 1e-2) -> Tensor:
 
     Depths under ``nearest`` metres are raised to it, so that a point at or behind the camera gives
     a finite pixel and a finite gradient.
+
+    >>> camera = facing_camera(640, 480, focal=500.0)
+    >>> project(camera, torch.tensor([0.1, 0.2, -1.0]))  # a metre before the camera, to the right and up
+    tensor([370., 140.])
     """
     in_camera = to_camera(camera, points)
     depth = in_camera[..., 2:].clamp_min(nearest)

@@ -52,6 +52,10 @@ def composite(
     Args:
         color: not multiplied with alpha, as a camera gives it.
         alpha, background: as for ``over``.
+
+    >>> red, half = torch.tensor([[[1.0, 0.0, 0.0]]]), torch.tensor([[0.5]])
+    >>> composite(red, half, "white")
+    tensor([[[1.0000, 0.5000, 0.5000]]])
     """
     return over(color * alpha[..., None], alpha, background)
 

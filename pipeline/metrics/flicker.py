@@ -24,6 +24,11 @@ def flicker(render: Tensor, before: Tensor, truth: Tensor, truth_before: Tensor,
 
     Returns:
         Levels of 255; NaN where no pixel counts.
+
+    >>> import torch
+    >>> still, all_pixels = torch.zeros(4, 4, 3), torch.ones(4, 4, dtype=torch.bool)
+    >>> round(flicker(still + 0.1, still, still, still, all_pixels), 1)
+    25.5
     """
     change = (render - truth) - (before - truth_before)
     return float(change.abs()[inside].double().mean()) * LEVELS if bool(inside.any()) else float("nan")

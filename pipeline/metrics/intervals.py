@@ -59,6 +59,10 @@ def interval(
 
     Returns:
         The interval; None without a value. Of one value its ends are that value.
+
+    >>> found = interval(np.array([30.0, 31.0, 29.0, 30.0]))
+    >>> found.mean, found.low < 30 < found.high
+    (30.0, True)
     """
     values = np.asarray(values, np.float64)
     values = values[~np.isnan(values)]

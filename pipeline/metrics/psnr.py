@@ -25,6 +25,10 @@ def psnr(
 
     Raises:
         ValueError: the images differ in shape or are not [H, W, 3].
+
+    >>> import torch
+    >>> round(psnr(torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1)), 3)
+    20.0
     """
     require_pair(image, truth)
     if mask is not None:

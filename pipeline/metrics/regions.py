@@ -53,6 +53,11 @@ def interior(mask: np.ndarray, erosion: int = EROSION) -> Tensor:
 
     Returns:
         [H, W] bool; all false where nothing is left.
+
+    >>> mask = np.zeros((20, 20), np.uint8)
+    >>> mask[5:15, 5:15] = 255
+    >>> int(interior(mask, erosion=3).sum())  # of 10 x 10 pixels 4 x 4 are left
+    16
     """
     inside = (mask > INSIDE * 255).astype(np.uint8)
     square = np.ones((2 * erosion + 1, 2 * erosion + 1), np.uint8)

@@ -52,6 +52,10 @@ def ssim(
 
     Raises:
         ValueError: the images differ in shape or are not [H, W, 3].
+
+    >>> image = torch.rand(32, 32, 3)
+    >>> ssim(image, image)
+    1.0
     """
     require_pair(image, truth)
     x, y = (_at_least_window(one.detach().cpu().double(), background).numpy() for one in (image, truth))
@@ -80,6 +84,12 @@ def ssim_loss(
 
     Raises:
         ValueError: the images differ in shape or are not [H, W, 3].
+
+    >>> image = torch.full((32, 32, 3), 0.5, requires_grad=True)
+    >>> loss = ssim_loss(image, torch.zeros(32, 32, 3))
+    >>> loss.backward()
+    >>> image.grad.shape
+    torch.Size([32, 32, 3])
     """
     require_pair(image, target)
     if min(image.shape[:2]) < WINDOW:

@@ -29,6 +29,20 @@ def render(gaussians: Gaussians, camera: Camera, backend: str = "auto") -> Rende
     Raises:
         ValueError: no such backend, an empty image, or tensors on a device that the backend does not serve.
         UserError: gsplat is asked for and not installed.
+
+    A single red Gaussian, two metres before the camera:
+
+    >>> from pipeline.clip.camera import facing_camera
+    >>> red = Gaussians(
+    ...     means=torch.tensor([[0.0, 0.0, -2.0]]),
+    ...     quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+    ...     scales=torch.full((1, 3), 0.2),
+    ...     colors=torch.tensor([[1.0, 0.0, 0.0]]),
+    ...     opacities=torch.tensor([0.9]),
+    ... )
+    >>> rendering = render(red, facing_camera(32, 32, focal=32.0))
+    >>> rendering.color.shape, [round(value, 1) for value in rendering.color[16, 16].tolist()]
+    (torch.Size([32, 32, 3]), [0.9, 0.0, 0.0])
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, not {backend!r}")

@@ -138,7 +138,11 @@ def robust_mean(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The value at which half of the weight is reached, along the first axis: [K, N] twice -> [N]."""
+    """The value at which half of the weight is reached, along the first axis: [K, N] twice -> [N].
+
+    >>> weighted_median(np.array([[10], [12], [200]]), np.array([[1.0], [1.0], [1.0]]))
+    array([12.], dtype=float32)
+    """
     order = np.argsort(values, axis=0, kind="stable")
     ordered = np.take_along_axis(values, order, 0)
     reached = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)

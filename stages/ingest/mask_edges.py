@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 REACH = 0.03  # half the box's side, of the square root of the person's area
-UNSURE = 0.02  # pixels further than this from 0 and from 1 are looked at
+UNSURE = 0.02  # pixels further than this from 0 and from 1 are moved
 RIDGE = 1e-3  # squared colour differences, of colours in [0, 1], below which there is no edge
 BLIND, CLEAR = 0.5, 0.85  # share of the mask's variance that colour explains: ignored, believed
 SOFTNESS = 0.8  # pixels, the blur that makes the edge smooth again

@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.errors import UserError
 from pipeline.untrusted import check_picture
 
+VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _VIDEO_REMEDY = "give a video that FFmpeg can play, or a folder of pictures"
 

@@ -75,7 +75,7 @@ def frames_by_name(names: Iterable[str], clip: Clip, total: int, path: Path) -> 
     Args:
         names: as the calibration has them, such as ``image12.jpg``, ``frames/00012.png`` or ``12``.
         clip: the footage.
-        total: how many frames a video has; 0 if nobody knows, and then the numbers are believed.
+        total: how many frames a video has; 0 if unknown, and then the numbers are not checked.
         path: the calibration, for messages.
 
     Raises:

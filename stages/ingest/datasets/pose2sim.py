@@ -21,9 +21,8 @@ from pipeline.config.settings import near
 from pipeline.errors import UserError
 from stages.ingest.cameras.rig import camera_names, read_rig
 from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot
-from stages.ingest.datasets.talkshow import VIDEOS
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import open_clip
+from stages.ingest.video import VIDEOS, open_clip
 
 _REMEDY = "give a folder with videos/ and calibration/"
 

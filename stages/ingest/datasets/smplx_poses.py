@@ -70,7 +70,7 @@ def smpl_poses(
 
     Args:
         frames: T frame numbers.
-        poses: theta, radians; the first three of each are not looked at.
+        poses: theta, radians; the first three of each are ignored.
         root: the root's rotation, model to camera axes.
         pelvis: the root joint in the camera's axes, metres.
         betas: SMPL's shape, kept for the record: it means nothing to SMPL-X.

@@ -30,9 +30,8 @@ from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Cal
 from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import open_clip
+from stages.ingest.video import VIDEOS, open_clip
 
-VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 _REMEDY = "take SHOW's .pkl again, or leave it out"
 _PARTS = (  # key -> numbers a frame, the joint it begins at
     ("global_orient", 3, 0), ("body_pose_axis", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),

@@ -19,10 +19,10 @@ FOCAL = {"full": 1.2, "upper": 1.5, "head": 2.2}
 """Focal length over the picture's side: closer framings are filmed with longer lenses."""
 
 WANDERING = {"full": (0.4, 1.0, 0.4), "upper": (0.1, 0.1, 0.1), "head": (0.05, 0.05, 0.05)}
-"""How much of the motion's way along X, Y and Z is kept: a still camera must hold whoever wanders."""
+"""The share of the motion's way along X, Y and Z that is kept, so that a still camera holds the body."""
 
 _FILL = 0.93  # of the picture's height, by what is framed
-_SAMPLES = 24  # frames that are looked at to place the camera
+_SAMPLES = 24  # frames that place the camera
 
 
 @dataclasses.dataclass(frozen=True)
