@@ -205,7 +205,7 @@ def _cell(value: Any) -> str:
     """A value as a table shows it: four figures of a number."""
     if isinstance(value, float):
         return f"{value:.0f}" if 1000 <= abs(value) < math.inf else f"{value:.4g}"
-    return str(value)
+    return "" if value is None else str(value)
 
 
 def _finite(value: Any) -> Any:

@@ -90,4 +90,3 @@ class _Mark(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         ctx.clock.enter(ctx.part)
         return gradient, None, None
-
