@@ -31,7 +31,7 @@ from pipeline.clip.composite import over
 from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
-from stages.train.regularisers import unmixed
+from stages.train.body_regions import unmixed
 
 REST = "pose, skin"
 PARTS = ("triplane", "static heads", "pose heads", REST, "render", "losses", "regularisers", "Adam")

@@ -46,7 +46,7 @@ MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 class TrainSettings:
     """Settings of the train stage; every schedule counts iterations, never seconds.
 
-    What begins with a ``_from`` is a fraction of the run; a heads' or the gate's 1 means never.
+    Settings that end in ``_from`` are fractions of the run; 1 means never where they start heads or the gate.
     """
 
     seed: Seed = setting(0, "of the initial weights and of every random draw")

@@ -1,4 +1,4 @@
-"""Regularisers by body part (paper, Section 3.6 and supplement D, after ExAvatar): their weights and pairs.
+"""Body regions that regularisers weigh apart: hands, face, undersides of arms (Section 3.6, supplement D).
 
 What is regularised is what is rendered. ExAvatar also renders and regularises the avatar without its
 pose-dependent part; the paper's Equation 9 does not, and neither does this. The terms on joint offsets
