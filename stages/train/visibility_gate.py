@@ -5,9 +5,9 @@ That is measured for gated vertices as for all others, by posing the bare body, 
 
 The score v_i is the share of the drawn frames that show vertex i (Eq. 6). Captured and generated frames are
 counted separately, from the first iteration to the last. After the warm-up, and regularly again, a
-threshold is found in the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies below it is gated: it leaves
-``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
-that a region that comes into view later returns.
+threshold is found in the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies
+below it is gated: it leaves ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores
+go on being measured, so that a region that comes into view later returns.
 
 The counters and the avatar's own mark of what is active are buffers; a checkpoint holds them, and a
 resumed run goes on exactly as one that was never stopped.
