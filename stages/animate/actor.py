@@ -16,7 +16,7 @@ _LEGS = ("left_leg", "right_leg")
 
 
 @dataclasses.dataclass(frozen=True)
-class Known:
+class PoseRange:
     """How far the training frames turn each joint.
 
     Attributes:
@@ -27,7 +27,7 @@ class Known:
     high: Tensor
 
     @classmethod
-    def of(cls, poses: Poses, frames: tuple[int, ...]) -> Known:
+    def of(cls, poses: Poses, frames: tuple[int, ...]) -> PoseRange:
         """The range of some frames of a clip."""
         rows = [row for row, frame in enumerate(poses.frames) if frame in set(frames)]
         features = torch.stack([pose_features(poses.rotation[row]) for row in rows])
@@ -52,7 +52,7 @@ class Actor:
 
     avatar: Avatar
     baked: BakedAvatar | None
-    known: Known | None
+    known: PoseRange | None
     extra: Surface | None
     parts: Tensor
 
@@ -76,7 +76,7 @@ class Actor:
 
 
 @torch.no_grad()
-def make_actor(avatar: Avatar, baking: bool, unseen: str, known: Known | None) -> Actor:
+def make_actor(avatar: Avatar, baking: bool, unseen: str, known: PoseRange | None) -> Actor:
     """An avatar ready to be moved; its ``unseen`` is changed.
 
     Args:

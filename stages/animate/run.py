@@ -18,17 +18,17 @@ from pipeline.clip.composite import over, to_bytes
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.records import read_cameras, read_split, write_cameras
 from pipeline.files.json_files import write_json
-from pipeline.motion.motion import Span
-from pipeline.motion.motion_name import TURNTABLE, motion_name
-from pipeline.motion.placement import place
-from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
 from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
 from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, Rendering, render, write_ply
-from stages.animate.actor import Actor, Known, legs_share, make_actor
-from stages.animate.layers import NAMES, layers_of, write_layers
-from stages.animate.script import Script, cameras_of, origin_of, turntable
+from stages.animate.actor import Actor, PoseRange, legs_share, make_actor
+from stages.animate.cameras import Animation, cameras_of, clip_start, turntable
+from stages.animate.exr_layers import NAMES, exr_layers, write_layers
+from stages.animate.motions.motion import Span
+from stages.animate.motions.placement import place
+from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_hands
+from stages.animate.motions.source import TURNTABLE, motion_source
 from stages.animate.settings import AnimateSettings
 
 _HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
@@ -61,18 +61,18 @@ def run(context: Context) -> None:
     tell(context, script, len(actor))
 
 
-def written(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> Script:
+def written(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> Animation:
     """Reads the motion and gives it to the person."""
     settings: AnimateSettings = context.settings
-    name, identity = motion_name(settings.motion), avatar.identity
+    name, identity = motion_source(settings.motion), avatar.identity
     if name.kind == TURNTABLE:
         return turntable(body, identity, settings)
     span = Span(settings.first_frame, settings.last_frame, settings.fps)
-    wearer = Wearer(body, context.body_file, identity)
-    motion = read_motion(name, wearer, span, settings.up, context.loans)
+    person = DrivenPerson(body, context.body_file, identity)
+    motion = read_motion(name, person, span, settings.up, context.loans)
     motion = with_relaxed_hands(motion, read_hand_mean(context.body_file))
     placed = place(motion, body, identity, in_place(settings, legs))
-    return Script(placed, motion.numbers, motion.fps, motion=motion)
+    return Animation(placed, motion.numbers, motion.fps, motion=motion)
 
 
 def in_place(settings: AnimateSettings, legs: float) -> bool:
@@ -80,7 +80,7 @@ def in_place(settings: AnimateSettings, legs: float) -> bool:
     return settings.way == "still" or (settings.way == "auto" and legs < _HALF_LEGS)
 
 
-def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
+def actor_of(context: Context, avatar: Avatar, script: Animation) -> Actor:
     """The avatar, ready to be moved."""
     settings: AnimateSettings = context.settings
     poses = 1 if script.still else len(script)
@@ -88,25 +88,25 @@ def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
     known = None
     if settings.heads == "known":
         train = read_split(context.inputs["ingest"] / "split.json").train
-        known = Known.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
+        known = PoseRange.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
     return make_actor(avatar, baking, settings.unseen, known)
 
 
-def posed(script: Script, actor: Actor, frame: int) -> Gaussians:
+def posed(script: Animation, actor: Actor, frame: int) -> Gaussians:
     """The Gaussians of a frame."""
     return actor.gaussians(script.placed.pose(frame))
 
 
-def shots(context: Context, script: Script, actor: Actor, body: BodyModel) -> list[Camera]:
+def shots(context: Context, script: Animation, actor: Actor, body: BodyModel) -> list[Camera]:
     """A camera a frame."""
     ingest, identity = context.inputs["ingest"], actor.avatar.identity
     poses = read_poses(context.inputs["fit"] / "poses.parquet")
-    origin = origin_of(poses, read_cameras(ingest / "cameras.parquet"), body, identity)
+    origin = clip_start(poses, read_cameras(ingest / "cameras.parquet"), body, identity)
     pelvis = rest_joints(body, identity)[0] + script.placed.transl[0]
     return cameras_of(script, lambda frame: posed(script, actor, frame), context.settings, origin, pelvis)
 
 
-def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) -> None:
+def film(context: Context, script: Animation, actor: Actor, cameras: list[Camera]) -> None:
     """Draws every frame once and writes what is asked for."""
     settings: AnimateSettings = context.settings
     for kind in ("exr", "ply"):
@@ -136,7 +136,7 @@ def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) 
 
 
 def drawn(
-    context: Context, script: Script, actor: Actor, cameras: list[Camera], spent: dict[str, list[float]]
+    context: Context, script: Animation, actor: Actor, cameras: list[Camera], spent: dict[str, list[float]]
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Every frame with its picture; splats and layers are written on the way, if they are asked for.
 
@@ -158,7 +158,7 @@ def drawn(
             write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians)
             clock.note("ply")
         if "exr" in settings.outputs:
-            layers = layers_of(gaussians, actor.parts, camera, rendering)
+            layers = exr_layers(gaussians, actor.parts, camera, rendering)
             clock.note("layers")
             write_layers(context.output / "exr" / f"{frame:06d}.exr", layers)
             clock.note("exr")
@@ -187,7 +187,7 @@ def sheet_rows(count: int, wanted: int) -> set[int]:
     return {0} if wanted == 1 else set(spread_end_to_end(range(count), wanted))
 
 
-def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float) -> dict[str, Any]:
+def summary(settings: AnimateSettings, script: Animation, actor: Actor, legs: float) -> dict[str, Any]:
     """What ``animate.json`` holds. What differs between equal runs, the times, is in ``run.json``."""
     motion = script.motion
     found: dict[str, Any] = {
@@ -215,7 +215,7 @@ def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float
     return found
 
 
-def tell(context: Context, script: Script, gaussians: int) -> None:
+def tell(context: Context, script: Animation, gaussians: int) -> None:
     """Says in a few lines what was made and what a user should know of it."""
     motion = script.motion
     for note in motion.notes if motion else ():

@@ -14,7 +14,7 @@ from pipeline.body.rasterize import Raster
 from pipeline.clip.boxes import Box
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
-from stages.auxiliary.texture import FineSurface
+from pipeline.texture import FineSurface
 
 SHOWN = 0.5  # share of the training frames that must have a vertex within their borders
 LOOKED_AT = 24  # training frames that are asked

@@ -18,10 +18,10 @@ from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras
 from pipeline.files.json_files import write_json
 from pipeline.pictures import side_by_side
-from stages.auxiliary.accept import Accepted
+from pipeline.texture import FineSurface
 from stages.auxiliary.crop import Framing, crop
-from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import ID_OFFSET
+from stages.auxiliary.filter_frames import FilteredFrames
+from stages.auxiliary.turntable_motion import ID_OFFSET
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -35,7 +35,7 @@ _SHEET, _TILE = 8, 256  # frames of the contact sheet, and pixels of their heigh
 def publish(
     context: Context,
     clip: FittedClip,
-    accepted: Accepted,
+    accepted: FilteredFrames,
     framing: Framing,
     surface: FineSurface,
     known: np.ndarray,  # [N]
@@ -84,7 +84,7 @@ def publish(
 
 
 def write_records(
-    context: Context, accepted: Accepted, cameras: dict[int, Camera], refused: dict[str, int]
+    context: Context, accepted: FilteredFrames, cameras: dict[int, Camera], refused: dict[str, int]
 ) -> None:
     """Write cameras, poses, keypoints and ``auxiliary.json`` of the frames that have a camera."""
     output, frames = context.output, sorted(cameras)

@@ -18,10 +18,10 @@ from pipeline.body import Landmarks, joint_index, joint_orientations, locate, po
 from pipeline.clip.camera import Camera, project
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
+from pipeline.texture import FineSurface, paint
 from stages.auxiliary.crop import Framing
 from stages.auxiliary.skeleton import driven_keypoints
-from stages.auxiliary.texture import FineSurface, paint
-from stages.auxiliary.turn import Turn
+from stages.auxiliary.turntable_motion import TurntableMotion
 
 LOOKED_AT = 60  # frames that are scored
 WEIGHTS = {"facing": 2.0, "sharpness": 1.0, "face": 1.0, "hands": 0.5, "mask": 1.0}
@@ -115,7 +115,7 @@ class Reference:
 
 def make_reference(
     clip: FittedClip,
-    turn: Turn,
+    turn: TurntableMotion,
     landmarks: Landmarks,
     framing: Framing,
     surface: FineSurface,
@@ -144,7 +144,9 @@ def make_reference(
     return Reference(np.clip(np.round(picture), 0, 255).astype(np.uint8), keypoints, score, not whole)
 
 
-def moved_camera(clip: FittedClip, turn: Turn, landmarks: Landmarks, frame, joints, vertices) -> Camera:
+def moved_camera(
+    clip: FittedClip, turn: TurntableMotion, landmarks: Landmarks, frame, joints, vertices
+) -> Camera:
     """The clip's camera with its picture moved and scaled onto the turn's first skeleton."""
     camera = clip.cameras[frame]
     there = pose_frame(clip.body, clip.identity, turn.poses.pose(0))

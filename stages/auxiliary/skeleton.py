@@ -17,7 +17,7 @@ from pipeline.body import Landmarks, locate, pose_frame, rasterize
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from stages.auxiliary.turn import Turn
+from stages.auxiliary.turntable_motion import TurntableMotion
 
 LEAST = 0.3  # the score under which a point is not drawn
 DIMMED = 0.6  # of the body layer's limbs
@@ -139,7 +139,7 @@ def driven_keypoints(
     return np.concatenate([pixels, (scores * inside)[:, None]], axis=1).astype(np.float32)
 
 
-def turn_keypoints(clip: FittedClip, turn: Turn, landmarks: Landmarks) -> np.ndarray:
+def turntable_keypoints(clip: FittedClip, turn: TurntableMotion, landmarks: Landmarks) -> np.ndarray:
     """The driving skeletons of a whole turn: [T, 133, 3] float32."""
     found = []
     for frame in turn.poses.frames:

@@ -32,7 +32,7 @@ from pipeline.files.tables import write_table
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.run.stage import Context
-from stages.fit.initial_poses import given_poses, keep_given
+from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of

@@ -37,7 +37,7 @@ _OUTLIER = 4.0  # squared residual over squared noise from which a point loses i
 
 
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class FaceObservations:
     """A face's F points as they were seen in T frames.
 
     Attributes:
@@ -52,13 +52,13 @@ class Sight:
     mask: Tensor
     focal: Tensor
 
-    def frames(self, rows: Tensor | slice) -> Sight:
+    def frames(self, rows: Tensor | slice) -> FaceObservations:
         """Some of the frames."""
-        return Sight(self.pixels[rows], self.depth[rows], self.mask[rows], self.focal[rows])
+        return FaceObservations(self.pixels[rows], self.depth[rows], self.mask[rows], self.focal[rows])
 
 
 @dataclasses.dataclass(frozen=True)
-class Heads:
+class HeadPoses:
     """The unknowns of T frames.
 
     Attributes:
@@ -77,7 +77,7 @@ class Heads:
 
 
 @dataclasses.dataclass(frozen=True)
-class Lens:
+class FaceNoise:
     """The quality of the observations.
 
     Attributes:
@@ -90,7 +90,7 @@ class Lens:
 
 
 @dataclasses.dataclass(frozen=True)
-class Linear:
+class Linearisation:
     """The model about the present unknowns.
 
     Attributes:
@@ -108,8 +108,8 @@ class Linear:
     posed: Tensor
 
 
-def start(model: FaceModel, sight: Sight) -> Heads:
-    """Heads by Procrustes' fit of the points that neither the jaw nor an expression moves."""
+def start(model: FaceModel, sight: FaceObservations) -> HeadPoses:
+    """HeadPoses by Procrustes' fit of the points that neither the jaw nor an expression moves."""
     weights = sight.mask * rigidity(model)
     seen = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
     nothing = weights.sum(1) < 1e-6
@@ -122,7 +122,7 @@ def start(model: FaceModel, sight: Sight) -> Heads:
     ahead = torch.cat([middle[:, :2] / sight.focal * distance[:, None], distance[:, None]], dim=1)
     place = ahead - (rotation @ centre[..., None])[..., 0]
     zeros = seen.new_zeros(len(seen), model.expression.shape[2])
-    return Heads(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
+    return HeadPoses(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
 
 
 def rigidity(model: FaceModel) -> Tensor:
@@ -131,7 +131,9 @@ def rigidity(model: FaceModel) -> Tensor:
     return (1 - model.jaw_weight).clamp_min(0) ** 4 / (1 + moves.square())
 
 
-def solve(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens, steps: int) -> Heads:
+def solve(
+    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise, steps: int
+) -> HeadPoses:
     """Gauss-Newton steps on every frame.
 
     Args:
@@ -145,15 +147,17 @@ def solve(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: L
     done = []
     for begin in range(0, len(sight.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
-        part = Heads(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(Heads)))
-        seen, quality = sight.frames(rows), Lens(lens.noise[rows], lens.gain)
+        part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
+        seen, quality = sight.frames(rows), FaceNoise(lens.noise[rows], lens.gain)
         for _ in range(steps):
             part = _step(model, linearise(model, neutral, seen, part, quality), part, seen, quality)
         done.append(part)
-    return Heads(*(torch.cat([getattr(p, f.name) for p in done]) for f in dataclasses.fields(Heads)))
+    return HeadPoses(*(torch.cat([getattr(p, f.name) for p in done]) for f in dataclasses.fields(HeadPoses)))
 
 
-def linearise(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Linear:
+def linearise(
+    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
+) -> Linearisation:
     """Residuals and derivatives; arguments as in ``solve``."""
     turn = roma.rotvec_to_rotmat(_about_x(heads.jaw))  # [T, 3, 3]
     eye = torch.eye(3, dtype=turn.dtype)
@@ -174,10 +178,12 @@ def linearise(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, len
     camera[..., 0, 0], camera[..., 1, 1] = (focal / near).unbind(-1)
     camera[..., :2, 2] = -pixels / near
     camera[..., 2, 2] = per_metre[..., 0]
-    return Linear(residual, weight, camera / sigma[..., None], heads.rotation[:, None] @ blend, posed)
+    return Linearisation(residual, weight, camera / sigma[..., None], heads.rotation[:, None] @ blend, posed)
 
 
-def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Lens) -> Heads:
+def _step(
+    model: FaceModel, linear: Linearisation, heads: HeadPoses, sight: FaceObservations, lens: FaceNoise
+) -> HeadPoses:
     """One damped Gauss-Newton step; priors on the jaw and psi are part of the normal equations."""
     jacobian = _jacobian(model, linear, heads, lens)  # [T, F, 3, P]
     weighted = jacobian * (TOGETHER * linear.weight)[..., None, None]
@@ -193,7 +199,7 @@ def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Le
     normal = normal + torch.diag_embed(precision + damping)
     step = torch.linalg.solve(normal, right[..., None])[..., 0].float()
     turn = roma.rotvec_to_rotmat(step[:, :3].clamp(-0.5, 0.5))
-    return Heads(
+    return HeadPoses(
         rotation=roma.special_procrustes(heads.rotation @ turn),
         place=heads.place + step[:, 3:6],
         origin=heads.origin + step[:, 6],
@@ -202,7 +208,7 @@ def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Le
     )
 
 
-def _jacobian(model: FaceModel, linear: Linear, heads: Heads, lens: Lens) -> Tensor:
+def _jacobian(model: FaceModel, linear: Linearisation, heads: HeadPoses, lens: FaceNoise) -> Tensor:
     """Derivatives by rotation, place, depth origin, jaw and psi: [T, F, 3, 8 + E]."""
     in_camera = linear.camera @ heads.rotation[:, None]  # by a shift in the head's axes
     axes = torch.eye(3, dtype=in_camera.dtype).expand(*linear.posed.shape, 3)

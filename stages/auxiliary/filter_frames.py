@@ -13,9 +13,9 @@ from pipeline.body import Landmarks, Poses, pose_frame, posed_vertices
 from pipeline.clip.camera import Camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.frames import read_mask, write_frame, write_mask
-from stages.auxiliary import check
-from stages.auxiliary.look import Look, Watcher
-from stages.auxiliary.offer import Offer, Picture
+from stages.auxiliary import frame_checks
+from stages.auxiliary.detect_generated import DetectedPicture, PictureDetector
+from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
 from stages.auxiliary.register import register
 from stages.auxiliary.skeleton import driven_keypoints
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Accepted:
+class FilteredFrames:
     """What is left of an offer. The pictures are in ``folder``, uncropped.
 
     Attributes:
@@ -48,9 +48,9 @@ class Accepted:
     notes: tuple[str, ...] = ()
 
 
-def accept_exact(
-    context: Context, clip: FittedClip, landmarks: Landmarks, offer: Offer, total: int
-) -> Accepted:
+def take_all(
+    context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput, total: int
+) -> FilteredFrames:
     """Take an offer whose pictures show their poses by construction; its keypoints are the poses' own."""
     folder, frames, points = _made(context), [], []
     with context.progress(total, "frames") as progress:
@@ -61,7 +61,7 @@ def accept_exact(
             points.append(driven_keypoints(clip, landmarks, joints, vertices, camera))
             frames.append(picture.frame)
             progress.advance()
-    return Accepted(
+    return FilteredFrames(
         folder=folder,
         poses=offer.poses.select(frames),
         cameras={frame: offer.cameras[frame] for frame in frames},
@@ -72,10 +72,12 @@ def accept_exact(
     )
 
 
-def accept_checked(context: Context, clip: FittedClip, landmarks: Landmarks, offer: Offer) -> Accepted:
+def filter_frames(
+    context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput
+) -> FilteredFrames:
     """Look at an offer, throw out what does not fit, and register the rest."""
-    settings, folder, watcher = context.settings, _made(context), Watcher(context)
-    looks: list[Look] = []
+    settings, folder, watcher = context.settings, _made(context), PictureDetector(context)
+    looks: list[DetectedPicture] = []
     with context.progress(len(offer.poses), "looking") as progress:
         for picture in offer.pictures:
             look = watcher.look(picture)
@@ -89,15 +91,15 @@ def accept_checked(context: Context, clip: FittedClip, landmarks: Landmarks, off
     frames = [looks[row].frame for row in left]
     poses = offer.poses.select(frames)
     if settings.register and left:
-        usable = [check.usable_points(looks[row].keypoints, driving.matched[row]) for row in left]
+        usable = [frame_checks.usable_points(looks[row].keypoints, driving.matched[row]) for row in left]
         cameras = [offer.cameras[frame] for frame in frames]
         poses = register(clip, landmarks, poses, cameras, np.stack(usable))
     for row in left:
         frame = looks[row].frame
         mask = read_mask(folder / "masks", frame)
         vertices = posed_vertices(clip.body, clip.identity, poses.pose(frame))
-        if not check.mask_fits(clip, vertices, offer.cameras[frame], mask, settings):
-            reasons[row] = check.MASK
+        if not frame_checks.mask_fits(clip, vertices, offer.cameras[frame], mask, settings):
+            reasons[row] = frame_checks.MASK
     kept = [row for row in left if reasons[row] is None]
     frames = [looks[row].frame for row in kept]
     notes = (
@@ -105,7 +107,7 @@ def accept_checked(context: Context, clip: FittedClip, landmarks: Landmarks, off
         if subject is not None
         else ("no face in the clip is large enough to be known again: identity was not checked",)
     )
-    return Accepted(
+    return FilteredFrames(
         folder=folder,
         poses=poses.select(frames),
         cameras={frame: offer.cameras[frame] for frame in frames},
@@ -123,43 +125,45 @@ def accept_checked(context: Context, clip: FittedClip, landmarks: Landmarks, off
 class _Driving:
     """What the driving poses say of each looked-at frame."""
 
-    matched: list[check.Matched]
+    matched: list[frame_checks.KeypointMatch]
     cosines: list[float]
     identity: list[float | None] = dataclasses.field(default_factory=list)
 
 
-def _driving(clip: FittedClip, landmarks: Landmarks, offer: Offer, looks: list[Look]) -> _Driving:
+def _driving(
+    clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput, looks: list[DetectedPicture]
+) -> _Driving:
     matched, cosines = [], []
     for look in looks:
         pose, camera = offer.poses.pose(look.frame), offer.cameras[look.frame]
         vertices, joints = pose_frame(clip.body, clip.identity, pose)
         driven = driven_keypoints(clip, landmarks, joints, vertices, camera)
-        place = check.mean_place(vertices)
-        cosines.append(check.head_facing(clip, pose, camera, place))
-        matched.append(check.match(look.keypoints, driven, cosines[-1]))
+        place = frame_checks.mean_place(vertices)
+        cosines.append(frame_checks.head_facing(clip, pose, camera, place))
+        matched.append(frame_checks.match_keypoints(look.keypoints, driven, cosines[-1]))
     return _Driving(matched, cosines)
 
 
 def _first_reasons(
-    looks: list[Look], driving: _Driving, subject: np.ndarray | None, settings
+    looks: list[DetectedPicture], driving: _Driving, subject: np.ndarray | None, settings
 ) -> list[str | None]:
     """Why each frame is refused before it is registered, or None."""
     limit = settings.identity_distance
-    driving.identity, stranger = check.other_faces(looks, driving.cosines, subject, limit)
-    flickers = check.flickering(looks, settings.flicker)
+    driving.identity, stranger = frame_checks.other_faces(looks, driving.cosines, subject, limit)
+    flickers = frame_checks.flickering(looks, settings.flicker)
     reasons: list[str | None] = []
     for row, look in enumerate(looks):
         face = driving.identity[row]
         if not look.found:
-            reasons.append(check.NOBODY)
+            reasons.append(frame_checks.NOBODY)
         elif stranger or (face is not None and face > limit):
-            reasons.append(check.FACE_OF)
+            reasons.append(frame_checks.FACE_OF)
         elif driving.matched[row].distance > settings.keypoint_distance:
-            reasons.append(check.POSE)
-        elif check.wrong_way(look, driving.cosines[row]):
-            reasons.append(check.AWAY)
+            reasons.append(frame_checks.POSE)
+        elif frame_checks.wrong_way(look, driving.cosines[row]):
+            reasons.append(frame_checks.AWAY)
         else:
-            reasons.append(check.FLICKER if flickers[row] else None)
+            reasons.append(frame_checks.FLICKER if flickers[row] else None)
     return reasons
 
 
@@ -170,7 +174,7 @@ def _made(context: Context) -> Path:
     return folder
 
 
-def _keep(folder: Path, picture: Picture, mask: np.ndarray | None) -> None:
+def _keep(folder: Path, picture: GeneratedPicture, mask: np.ndarray | None) -> None:
     write_frame(folder / "frames", picture.frame, picture.image)
     whole = np.full(picture.image.shape[:2], 255, np.uint8) if mask is None else mask
     write_mask(folder / "masks", picture.frame, whole)

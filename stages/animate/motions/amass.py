@@ -32,12 +32,10 @@ from torch import Tensor
 
 from pipeline.body import JOINT_NAMES, BodyModel
 from pipeline.errors import UserError
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import USUAL_FPS, Motion, Span
-from pipeline.pose_files.coefficients import is_official_smplx
+from pipeline.pose_files import is_official_smplx
 from pipeline.untrusted import read_npz
+from stages.animate.motions.motion import USUAL_FPS, Motion, Span, leg_length
 
-AXES = ("auto", "y", "z")
 _REMEDY = "name an AMASS or SMPL-X motion with poses (or root_orient and pose_body) and trans"
 _BODY, _FACE, _HANDS = slice(1, 22), slice(22, 25), slice(25, 55)
 _LAYOUTS = {66: (_BODY,), 72: (_BODY,), 156: (_BODY, _HANDS), 165: (_BODY, _FACE, _HANDS)}
@@ -84,7 +82,7 @@ def read_amass(path: Path, body: BodyModel, span: Span, up: str = "auto") -> Mot
         rotation=rotation.float(),
         expression=_expression(path, arrays, body, count, rows),
         root=root.float(),
-        leg=leg_of(body, betas=_betas(path, arrays) if is_official_smplx(body) else None),
+        leg=leg_length(body, betas=_betas(path, arrays) if is_official_smplx(body) else None),
         told=told,
         notes=tuple(notes),
     )

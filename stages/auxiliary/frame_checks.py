@@ -19,7 +19,7 @@ from pipeline.clip.camera import Camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import BODY, FACE
 from pipeline.metrics.face_identity import identity_distance
-from stages.auxiliary.look import Look
+from stages.auxiliary.detect_generated import DetectedPicture
 from stages.auxiliary.register import MIRRORED, POINTS, TRUSTED
 from stages.auxiliary.settings import AuxiliarySettings
 
@@ -39,7 +39,7 @@ LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg", "head", "face", "tors
 
 
 @dataclasses.dataclass(frozen=True)
-class Matched:
+class KeypointMatch:
     """A frame's keypoints against the driving ones.
 
     Attributes:
@@ -52,7 +52,7 @@ class Matched:
     mirrored: bool
 
 
-def match(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> Matched:
+def match_keypoints(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> KeypointMatch:
     """Compare [133, 3] keypoints with the driving pose's [133, 3].
 
     Args:
@@ -63,11 +63,11 @@ def match(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> Matche
     body, there = found[BODY], driven[BODY]
     inside = driven[BODY, 2] > 0
     if inside.sum() < 4:
-        return Matched(np.inf, False)
+        return KeypointMatch(np.inf, False)
     height = max(1.0, float(np.ptp(there[inside, 1])), float(np.ptp(there[inside, 0])))
     straight = _distance(body, there)
     exchanged = _distance(body[MIRRORED[:17]], there) if cosine < 0 else np.inf
-    return Matched(min(straight, exchanged) / height, exchanged < 0.7 * straight)
+    return KeypointMatch(min(straight, exchanged) / height, exchanged < 0.7 * straight)
 
 
 def _distance(found: np.ndarray, driven: np.ndarray) -> float:
@@ -77,7 +77,7 @@ def _distance(found: np.ndarray, driven: np.ndarray) -> float:
     return float(np.linalg.norm(found[both, :2] - driven[both, :2], axis=1).mean())
 
 
-def usable_points(found: np.ndarray, matched: Matched) -> np.ndarray:
+def usable_points(found: np.ndarray, matched: KeypointMatch) -> np.ndarray:
     """The points that a registration may use, left and right as the driving pose has them: [23, 3]."""
     points = found[POINTS]
     return points[MIRRORED] if matched.mirrored else points
@@ -97,7 +97,7 @@ def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> 
     return float(front @ view / view.norm())
 
 
-def wrong_way(look: Look, cosine: float) -> bool:
+def wrong_way(look: DetectedPicture, cosine: float) -> bool:
     """Whether a face is seen where there should be a back of a head, or none where there should be one."""
     seen = float(look.keypoints[FACE, 2].mean()) >= FACE_SCORE
     return (cosine > TOWARDS and not seen) or (cosine < BACKWARD and seen)
@@ -127,7 +127,7 @@ def mask_fits(
 
 
 def other_faces(
-    looks: Sequence[Look], cosines: Sequence[float], subject: np.ndarray | None, limit: float
+    looks: Sequence[DetectedPicture], cosines: Sequence[float], subject: np.ndarray | None, limit: float
 ) -> tuple[list[float | None], bool]:
     """Each frame's distance from the subject's face, and whether most of the frontal ones are too far.
 
@@ -141,7 +141,7 @@ def other_faces(
     return distances, bool(known) and float(np.median(known)) > limit
 
 
-def flickering(looks: Sequence[Look], times: float) -> list[bool]:
+def flickering(looks: Sequence[DetectedPicture], times: float) -> list[bool]:
     """Frames that differ from both neighbours by more than ``times`` what is usual."""
     if len(looks) < 4:
         return [False] * len(looks)

@@ -1,6 +1,6 @@
 """The face first from the estimator's 3D face mesh: the default source, which needs no other model.
 
-Heads and expressions of single frames (``frames``) alternate with the clip's neutral face (``neutral``).
+HeadPoses and expressions of single frames (``frames``) alternate with the clip's neutral face (``neutral``).
 The neutral face is learnt from at most 96 frames spread over the clip, so that long clips cost no
 more; then every frame is solved once against it. Trusts x and y more than z, and fits how much the
 estimator exaggerates depth.
@@ -13,10 +13,10 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from stages.fit.face.frames import Heads, Lens, Sight, linearise, solve, start
+from stages.fit.camera_batch import CameraBatch
+from stages.fit.face.head_poses import FaceNoise, FaceObservations, HeadPoses, linearise, solve, start
 from stages.fit.face.neutral import Modes, smooth_modes, solve_neutral
 from stages.fit.face.target import FaceModel, FaceTarget, make_target
-from stages.fit.views import Views
 
 _LEARNT_FROM = 96  # frames
 _ROUNDS = 4  # of heads, then neutral
@@ -28,7 +28,7 @@ _MISFIT, _BLUR = 0.2, 1.0  # of the face's size, and pixels: a frame that fits n
 _GAIN = (0.6, 1.6)
 
 
-def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: Views) -> FaceTarget | None:
+def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: CameraBatch) -> FaceTarget | None:
     """Fit a face to the estimator's face meshes.
 
     Args:
@@ -40,7 +40,7 @@ def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: Views) -
     Returns:
         None where no frame shows enough of a face.
     """
-    sight = Sight(mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal)
+    sight = FaceObservations(mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal)
     valid = (sight.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * sight.mask[..., None]).all((1, 2))
     if not valid.any():
         return None
@@ -49,7 +49,7 @@ def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: Views) -
     neutral, lens = _learn(model, smooth_modes(model), sight.frames(chosen))
     seen = sight.frames(rows)
     noise = lens.noise.median() / _sizes(sight.frames(chosen)).median() * _sizes(seen)
-    lens = Lens(noise, lens.gain)
+    lens = FaceNoise(noise, lens.gain)
     heads = solve(model, neutral, seen, start(model, seen), lens, steps=4)
     fits = _misfit(model, neutral, seen, heads, lens) < _MISFIT * _sizes(seen) + _BLUR
     if not fits.any():
@@ -57,10 +57,10 @@ def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: Views) -
     return _handed_on(model, neutral, heads, rows, fits, views)
 
 
-def _learn(model: FaceModel, modes: Modes, sight: Sight) -> tuple[Tensor, Lens]:
+def _learn(model: FaceModel, modes: Modes, sight: FaceObservations) -> tuple[Tensor, FaceNoise]:
     """The neutral face, and the quality of the observations that it was learnt from."""
     neutral, heads = model.mean, start(model, sight)
-    lens = Lens(_FIRST_NOISE * _sizes(sight))
+    lens = FaceNoise(_FIRST_NOISE * _sizes(sight))
     for _ in range(_ROUNDS):
         heads = solve(model, neutral, sight, heads, lens, steps=2)
         if len(sight.mask) >= _RESTS_WITHIN:
@@ -70,7 +70,7 @@ def _learn(model: FaceModel, modes: Modes, sight: Sight) -> tuple[Tensor, Lens]:
     return neutral, lens
 
 
-def _at_rest(model: FaceModel, neutral: Tensor, heads: Heads) -> tuple[Tensor, Heads]:
+def _at_rest(model: FaceModel, neutral: Tensor, heads: HeadPoses) -> tuple[Tensor, HeadPoses]:
     """The same faces with what psi is at rest moved from psi to the neutral face.
 
     An expression held throughout and a face of that shape look alike; but a face comes back to rest, and
@@ -89,7 +89,9 @@ def densest_half(values: Tensor) -> Tensor:
     return ordered.gather(0, begin + torch.arange(half)[:, None]).mean(0)
 
 
-def _quality(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Lens:
+def _quality(
+    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
+) -> FaceNoise:
     """Noise as the median says it, in proportion to the face's size, and the gain of depth."""
     linear = linearise(model, neutral, sight, heads, lens)
     trusted = sight.mask > 0
@@ -106,10 +108,12 @@ def _quality(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens
     ]
     predicted, found = predicted - mean[0], sight.depth - mean[1]
     gain = float((weight * predicted * found).sum() / (weight * predicted.square()).sum().clamp_min(1e-9))
-    return Lens(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
+    return FaceNoise(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
 
 
-def _misfit(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Tensor:
+def _misfit(
+    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
+) -> Tensor:
     """The median distance in pixels between seen and predicted points of each frame: [T]."""
     linear = linearise(model, neutral, sight, heads, lens)
     off = (linear.residual[..., :2] * lens.noise[:, None, None]).norm(dim=-1)
@@ -117,7 +121,7 @@ def _misfit(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens:
     return off.nanmedian(dim=1).values
 
 
-def _sizes(sight: Sight) -> Tensor:
+def _sizes(sight: FaceObservations) -> Tensor:
     """The size of each face in pixels, [T]: the spread of its points, depth included."""
     weight = sight.mask[..., None]
     places = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
@@ -127,7 +131,7 @@ def _sizes(sight: Sight) -> Tensor:
 
 
 def _handed_on(
-    model: FaceModel, neutral: Tensor, heads: Heads, rows: Tensor, fits: Tensor, views: Views
+    model: FaceModel, neutral: Tensor, heads: HeadPoses, rows: Tensor, fits: Tensor, views: CameraBatch
 ) -> FaceTarget:
     """The fitted rows of the clip, spread over all of its frames."""
     count, fitted = len(views.focal), rows[fits]
