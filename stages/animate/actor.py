@@ -1,4 +1,4 @@
-"""The avatar as this stage moves it: a pose in, Gaussians out."""
+"""The avatar in a pose, as Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LEGS = ("left_leg", "right_leg")
 
 @dataclasses.dataclass(frozen=True)
 class PoseRange:
-    """How far the training frames turn each joint.
+    """The range of poses in the training frames.
 
     Attributes:
         low, high: [324], of ``pose_features``.
@@ -34,7 +34,7 @@ class PoseRange:
         return cls(features.amin(0), features.amax(0))
 
     def nearest(self, pose: Pose) -> Tensor:
-        """What the heads are told of a pose: the nearest that lies in the range, [324]."""
+        """The features of the nearest pose in the range, [324], which the networks are given."""
         return pose_features(pose.rotation).clamp(self.low, self.high)
 
 

@@ -1,4 +1,4 @@
-"""What is shown, frame by frame: a pose and a camera each."""
+"""A camera for every frame of an animation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PosedFrame = Callable[[int], Gaussians]
 
 @dataclasses.dataclass(frozen=True)
 class Animation:
-    """What is shown.
+    """The poses that are shown, frame by frame.
 
     Attributes:
         placed: a pose a frame.
@@ -47,7 +47,7 @@ class Animation:
 
 @dataclasses.dataclass(frozen=True)
 class ClipStart:
-    """How the person's own clip began.
+    """The person's place in the first frame of the own clip.
 
     Attributes:
         camera: of its first frame.
@@ -71,7 +71,7 @@ def turntable(body: BodyModel, identity: Identity, settings: AnimateSettings) ->
 
 
 def clip_start(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identity: Identity) -> ClipStart:
-    """Where the person and the camera were in the clip's first frame."""
+    """The camera and the person's place in the clip's first frame."""
     camera = cameras[poses.frames[0]]
     pelvis = rest_joints(body, identity)[0] + poses.transl[0]
     return ClipStart(camera, camera.rotation @ pelvis + camera.translation)

@@ -97,7 +97,7 @@ def outward(gaussians: Gaussians) -> Tensor:
 
 
 def most_seen(gaussians: Gaussians, parts: Tensor, camera: Camera) -> Tensor:
-    """Which part has the largest weight in each pixel: [H, W] int64; only parts that there are are drawn."""
+    """The part with the largest weight in each pixel: [H, W] int64."""
     there = parts.unique().tolist()
     shares = []
     for start in range(0, len(there), 3):

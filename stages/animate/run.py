@@ -1,4 +1,4 @@
-"""The animate stage: reads a motion, gives it to the avatar, films it."""
+"""Running the animate stage: a motion is read, given to the avatar, and drawn."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def written(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> A
 
 
 def in_place(settings: AnimateSettings, legs: float) -> bool:
-    """Whether the pelvis stays where it is."""
+    """True if the pelvis stays where it is."""
     return settings.way == "still" or (settings.way == "auto" and legs < _HALF_LEGS)
 
 
@@ -188,7 +188,7 @@ def sheet_rows(count: int, wanted: int) -> set[int]:
 
 
 def summary(settings: AnimateSettings, script: Animation, actor: Actor, legs: float) -> dict[str, Any]:
-    """What ``animate.json`` holds. What differs between equal runs, the times, is in ``run.json``."""
+    """The content of ``animate.json``. Times, which differ between equal runs, are in ``run.json``."""
     motion = script.motion
     found: dict[str, Any] = {
         "motion": motion.name if motion else TURNTABLE,

@@ -1,4 +1,4 @@
-"""What the animate stage can be told."""
+"""Settings of the animate stage."""
 
 from __future__ import annotations
 

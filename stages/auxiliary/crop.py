@@ -1,4 +1,4 @@
-"""Full body in, the clip's own framing out (supplement B), and which pixels teach anything new."""
+"""Cropping a full-body picture to the clip's framing (supplement B), with a map of what is new in it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DOUBT = 0.03  # of the body's height: beside it hair and clothes may be, or not
 
 @dataclasses.dataclass(frozen=True)
 class Framing:
-    """What of the body the clip frames, and how large.
+    """The part of the body that the clip frames, and its size there.
 
     Attributes:
         shown: [V] float32, 1 for vertices that lie within the picture's borders in half of the frames or

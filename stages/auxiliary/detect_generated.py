@@ -1,4 +1,4 @@
-"""What is seen in generated frames: keypoints, a mask, whose face it is, and a small copy for flicker."""
+"""Detections in generated frames: keypoints, a mask, the face's embedding, and a thumbnail for flicker."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class DetectedPicture:
 
 
 class PictureDetector:
-    """Looks at generated frames, each by itself."""
+    """Detects the person in generated frames, each by itself."""
 
     def __init__(self, context: Context) -> None:
         """Load the estimator and the face reader."""
@@ -58,7 +58,7 @@ class PictureDetector:
         self._faces = FaceRecognizer(context.assets["dlib"], context.assets["identity"])
 
     def look(self, picture: GeneratedPicture) -> DetectedPicture:
-        """What is seen in one frame."""
+        """The detections in one frame."""
         height, width = picture.image.shape[:2]
         keypoints, mask, estimate = picture.keypoints, picture.mask, None
         if keypoints is None or mask is None:

@@ -1,4 +1,4 @@
-"""From a generator's offer to the frames that are learnt from: looked at, registered, checked, counted."""
+"""Filtering a generator's frames: detected, compared with the driving poses, registered, counted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class FilteredFrames:
-    """What is left of an offer. The pictures are in ``folder``, uncropped.
+    """The frames that are kept of a generator's output. The pictures are in ``folder``, uncropped.
 
     Attributes:
         folder: with ``frames`` and ``masks``.
@@ -51,7 +51,7 @@ class FilteredFrames:
 def take_all(
     context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput, total: int
 ) -> FilteredFrames:
-    """Take an offer whose pictures show their poses by construction; its keypoints are the poses' own."""
+    """All frames of an output whose pictures show their poses exactly; keypoints are the poses' own."""
     folder, frames, points = _made(context), [], []
     with context.progress(total, "frames") as progress:
         for picture in offer.pictures:
@@ -75,7 +75,7 @@ def take_all(
 def filter_frames(
     context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput
 ) -> FilteredFrames:
-    """Look at an offer, throw out what does not fit, and register the rest."""
+    """The frames of an output that pass the checks, registered to their keypoints."""
     settings, folder, watcher = context.settings, _made(context), PictureDetector(context)
     looks: list[DetectedPicture] = []
     with context.progress(len(offer.poses), "looking") as progress:
@@ -123,7 +123,7 @@ def filter_frames(
 
 @dataclasses.dataclass
 class _Driving:
-    """What the driving poses say of each looked-at frame."""
+    """Each frame compared with its driving pose."""
 
     matched: list[frame_checks.KeypointMatch]
     cosines: list[float]
@@ -147,7 +147,7 @@ def _driving(
 def _first_reasons(
     looks: list[DetectedPicture], driving: _Driving, subject: np.ndarray | None, settings
 ) -> list[str | None]:
-    """Why each frame is refused before it is registered, or None."""
+    """The reason for which each frame is refused before it is registered, or None."""
     limit = settings.identity_distance
     driving.identity, stranger = frame_checks.other_faces(looks, driving.cosines, subject, limit)
     flickers = frame_checks.flickering(looks, settings.flicker)

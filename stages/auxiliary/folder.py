@@ -39,7 +39,7 @@ _LARGEST = 1e6
 
 
 def read_folder(path: Path, clip: FittedClip, turn: TurntableMotion, body_file: Path) -> GeneratorOutput:
-    """What lies at ``path``, whichever layout it has.
+    """The frames at ``path``, in any of the layouts.
 
     Raises:
         UserError: there is nothing there, or it cannot be read.
@@ -170,7 +170,7 @@ def _fitted(images: list[np.ndarray], turn: TurntableMotion) -> Iterator[Generat
 
 
 def _places(count: int, turn: TurntableMotion) -> list[tuple[int, int]]:
-    """Which picture shows which frame of the turn: all of it, or evenly spread."""
+    """Pairs (picture, frame of the turn that it shows): all of the turn, or evenly spread."""
     return list(enumerate(spread_from_start(turn.poses.frames, count)))
 
 

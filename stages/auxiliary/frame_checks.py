@@ -1,4 +1,4 @@
-"""Which generated frames are fit to learn from; each refusal has a reason that is counted.
+"""Checks of generated frames; each refusal has a reason that is counted.
 
 Two looks at the whole sequence come first: if most of its frontal faces are another person's, all of it
 is; and what is usual from frame to frame says what flickers.
@@ -98,7 +98,7 @@ def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> 
 
 
 def wrong_way(look: DetectedPicture, cosine: float) -> bool:
-    """Whether a face is seen where there should be a back of a head, or none where there should be one."""
+    """True if a face is seen where there should be a back of a head, or none where there should be one."""
     seen = float(look.keypoints[FACE, 2].mean()) >= FACE_SCORE
     return (cosine > TOWARDS and not seen) or (cosine < BACKWARD and seen)
 
@@ -106,7 +106,7 @@ def wrong_way(look: DetectedPicture, cosine: float) -> bool:
 def mask_fits(
     clip: FittedClip, vertices: Tensor, camera: Camera, mask: np.ndarray, settings: AuxiliarySettings
 ) -> bool:
-    """Whether a mask covers every limb that should be seen and not much beside the body."""
+    """True if a mask covers every limb that should be seen and not much beside the body."""
     raster = rasterize(camera, vertices, clip.body.faces)
     body, person = raster.covered, mask > 127
     area = int(body.sum())

@@ -1,4 +1,4 @@
-"""What every generator gives: pictures of the person in known poses before known cameras."""
+"""The output of every generator: pictures of the person in known poses before known cameras."""
 
 from __future__ import annotations
 

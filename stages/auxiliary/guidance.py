@@ -1,4 +1,4 @@
-"""The folder that a pose-to-video model is given; docs/auxiliary.md says how.
+"""Writing the folder that a pose-to-video model is given, see docs/auxiliary.md.
 
 ::
 

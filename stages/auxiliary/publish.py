@@ -1,4 +1,4 @@
-"""What training reads: cropped frames with masks, trust, cameras and poses of their own, and the counts."""
+"""Publishing the frames for training: cropped, with masks, trust, cameras, poses, and the counts."""
 
 from __future__ import annotations
 

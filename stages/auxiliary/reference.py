@@ -31,7 +31,7 @@ _FEATHER = 0.01  # of the picture's height, over which the clip's picture runs i
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Why a frame was chosen; every part lies in [0, 1].
+    """The reasons for which a frame is chosen; every part lies in [0, 1].
 
     Attributes:
         frame: its number.
@@ -98,7 +98,7 @@ def surety(mask: np.ndarray) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The reference picture.
+    """The picture of the person that a generator is given.
 
     Attributes:
         image: [H, W, 3] uint8 RGB, of the turn's camera's size.

@@ -103,7 +103,7 @@ def register(
 
 
 def _heights(found: np.ndarray) -> Tensor:
-    """How tall the trusted points stand in each frame, pixels, at least 1: [T]."""
+    """The height of the trusted points in each frame, pixels, at least 1: [T]."""
     tall = []
     for points in found:
         rows = points[points[:, 2] >= TRUSTED, 1]

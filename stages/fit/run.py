@@ -1,4 +1,4 @@
-"""The fit stage: keypoints in, identity and poses out."""
+"""Running the fit stage: keypoints in, identity and poses out."""
 
 from __future__ import annotations
 

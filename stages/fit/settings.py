@@ -1,4 +1,4 @@
-"""What can be set about the fit; lengths in metres, angles in radians."""
+"""Settings of the fit; lengths in metres, angles in radians."""
 
 from __future__ import annotations
 

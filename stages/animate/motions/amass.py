@@ -173,7 +173,7 @@ def _expression(
 
 
 def _z_is_up(root: Tensor, up: str) -> bool:
-    """Whether Z is the world's up axis; root [T, 3] rotation vectors."""
+    """True if Z is the world's up axis; root [T, 3] rotation vectors."""
     if up != "auto":
         return up == "z"
     upward = roma.rotvec_to_rotmat(root)[:, :, 1].mean(0)  # where the body's own Y axis points

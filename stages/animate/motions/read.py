@@ -1,4 +1,4 @@
-"""The way in: whatever ``motion=`` names, as a ``Motion``."""
+"""Reading a motion of any kind that ``motion=`` names."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REFERENCE_FRAMES = 500  # among which the one with the straightest limbs is sou
 
 @dataclasses.dataclass(frozen=True)
 class DrivenPerson:
-    """Who is to be moved.
+    """The person that a motion is given to.
 
     Attributes:
         body: the body model.

@@ -24,7 +24,7 @@ CHUNK = 8  # frames that are decoded together
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
-    """How the video is denoised: MimicMotion 1.1's numbers are the stage's defaults."""
+    """Settings of the denoising: MimicMotion 1.1's numbers are the stage's defaults."""
 
     steps: int
     guidance: float

@@ -22,13 +22,13 @@ from stages.fit.face.target import FaceModel
 
 CHUNK = 64  # frames whose Jacobians are held at once
 DEPTH_NOISE = 3.0
-"""How much farther off the estimator's z is than its x and y.
+"""Noise of the estimator's z over that of its x and y.
 
 It is inferred from the face's look rather than seen, and errs by a tenth to a fifth of the face's depth.
 """
 
 TOGETHER = 0.25
-"""What a landmark counts for, since neighbouring ones err together: a quarter of a point."""
+"""Weight of a landmark, since neighbouring ones err together: a quarter of a point."""
 
 _EXPRESSION = 0.3  # standard deviation of a coefficient of psi; 3 is about all that a face can do
 _EXPRESSION_LIMIT = 3.0
