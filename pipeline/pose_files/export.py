@@ -60,12 +60,7 @@ def write_peer_files(
     """Write the files that the module's docstring lists.
 
     Args:
-        folder: made if it is not there.
-        body: the body that was fitted.
-        identity: beta, Delta J, Delta V_face.
-        raw: the poses as fitted.
         smoothed: the poses after smoothing, of the same frames.
-        cameras: frame number -> camera.
         hand_mean: [30, 3], what the tools will add to the hands, from ``read_hand_mean``.
 
     Raises:

@@ -28,7 +28,6 @@ def with_flat_hands(
     """The same poses with hands relative to flat hands.
 
     Args:
-        poses: of any kind.
         body_file: the body model's file, for mean and components.
         official: whether the file is SMPL-X's, whose components the coefficients belong to.
         log: told in a line if the hands' coefficients could not be used.

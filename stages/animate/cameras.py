@@ -78,16 +78,14 @@ def clip_start(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identi
 
 
 def cameras_of(
-    script: Animation, posed: PosedFrame, settings: AnimateSettings, origin: ClipStart, pelvis: torch.Tensor
+    animation: Animation, posed: PosedFrame, settings: AnimateSettings, origin: ClipStart, pelvis: torch.Tensor
 ) -> list[Camera]:
     """A camera a frame.
 
     Args:
-        script: what is shown.
-        posed: makes Gaussians of its frames.
-        settings: the stage's.
+        posed: makes Gaussians of the animation's frames.
         origin: of the person's own clip.
-        pelvis: [3], metres, where the pelvis is in the script's first frame.
+        pelvis: [3], metres, where the pelvis is in the animation's first frame.
     """
     size, count = (settings.width, settings.height), len(script)
     if settings.camera == "clip":

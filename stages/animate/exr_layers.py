@@ -70,7 +70,6 @@ def exr_layers(gaussians: Gaussians, parts: Tensor, camera: Camera, rendering: R
     Args:
         gaussians: that are shown.
         parts: [N] int64, the part of each.
-        camera: the view.
         rendering: what ``render`` made of the two.
     """
     alpha = rendering.alpha.clamp(0, 1)

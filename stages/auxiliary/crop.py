@@ -85,11 +85,8 @@ def crop(
 
     Args:
         image, mask: the picture and its person.
-        camera: of the picture.
         vertices: the registered body's.
-        surface: the fine mesh.
         carried: of its vertices: 1 where the clip shows nothing, and 1 where the clip frames it.
-        framing: of the clip.
 
     Returns:
         None where the picture shows nothing of what the clip frames.

@@ -30,7 +30,7 @@ class FilteredFrames:
     Attributes:
         folder: with ``frames`` and ``masks``.
         poses: of the kept frames, registered.
-        cameras: of each.
+        cameras: frame number -> camera.
         keypoints: [T, 133, 3], of the uncropped pictures.
         offered: how many frames there were.
         refused: reason -> how many.

@@ -87,9 +87,7 @@ def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> 
     """The cosine between the head's front and the way to the camera.
 
     Args:
-        clip: the body.
         pose: of the body.
-        camera: the view.
         place: [3], where the body is.
     """
     front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]

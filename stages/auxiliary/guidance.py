@@ -41,11 +41,7 @@ def write_guidance(
     """Write everything that the module's docstring lists.
 
     Args:
-        context: the stage's.
-        clip: the person.
-        turn: the driving motion.
         keypoints: [T, 133, 3], the turn's skeletons.
-        reference: the picture of the person.
     """
     folder, settings = context.output / FOLDER, context.settings
     (folder / "poses").mkdir(parents=True)

@@ -43,11 +43,6 @@ def publish(
     """Crop the accepted frames to the clip's framing and write them.
 
     Args:
-        context: the stage's.
-        clip: the person.
-        accepted: the frames.
-        framing: what the clip frames.
-        surface: the fine mesh.
         known: of its vertices, whether the clip shows it.
     """
     settings, output = context.settings, context.output

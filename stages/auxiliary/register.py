@@ -47,10 +47,7 @@ def register(
     """The poses, moved to the found keypoints.
 
     Args:
-        clip: the body and its identity.
-        landmarks: where the points are on it.
         poses: the T driving poses.
-        cameras: of each.
         found: pixels and scores, in the order of ``POINTS``.
     """
     points = landmarks.whole_body[POINTS]

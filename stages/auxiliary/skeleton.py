@@ -119,11 +119,8 @@ def driven_keypoints(
     A point of the face that is turned away scores 0, a joint behind the body ``OCCLUDED``, the rest 1.
 
     Args:
-        clip: the body.
-        landmarks: where the points are on it.
         joints: [55, 3], posed, metres.
         vertices: [V, 3], posed.
-        camera: the view.
     """
     places = locate(landmarks.whole_body, joints, vertices)
     pixels = project(camera, places).numpy()

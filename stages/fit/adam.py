@@ -168,9 +168,6 @@ def optimise(
     """Fit a clip.
 
     Args:
-        objective: its loss.
-        initial: where to start.
-        iterations: steps.
         frozen: names of groups of parameters that stay as they are.
         learning_rate: factor on every step.
         minibatch: frames that are posed at a time, which bounds the memory and changes nothing else.

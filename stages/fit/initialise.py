@@ -44,9 +44,6 @@ def initial_parameters(
 
     Args:
         keypoints: the clip's detections; only their 3D pose is used here.
-        observations: what the fit aims at.
-        model: the landmarks.
-        views: the cameras.
     """
     count = len(observations.frames)
     rotation = torch.zeros(count, 55, 3)
@@ -68,7 +65,6 @@ def with_face(parameters: Parameters, target: FaceTarget, movable: Tensor) -> Pa
 
     Args:
         parameters: of T frames.
-        target: the face.
         movable: [55] bool, joints that are fitted; the jaw stays where it may not move.
     """
     if not target.valid.any():
@@ -90,7 +86,6 @@ def bend_limbs(rotation: Tensor, keypoints: Keypoints, model: LandmarkModel, vie
         rotation: [T, 55, 3], rotation vectors; the torso's is set already.
         keypoints: the clip's detections; its 3D pose is used.
         model: the landmarks, for the rest joints.
-        views: the cameras.
     """
     world = torch.from_numpy(keypoints.pose_world)
     above = joint_orientations(rotation, model.parents)
@@ -196,8 +191,6 @@ def weak_perspective(points: Tensor, observations: Observations, views: CameraBa
 
     Args:
         points: [T, N, 3], posed landmarks without translation, in the world.
-        observations: what was seen.
-        views: the cameras.
 
     Returns:
         [T, 3], metres, in the world.

@@ -48,10 +48,8 @@ def given_poses(
     """The poses to start from: those of ``fit.pose_init``, else those that ingest has published.
 
     Args:
-        settings: the stage's.
         ingest: what ingest has published.
-        body: the body.
-        body_file: its file, for the hands.
+        body_file: the body's file, for the hands.
         frames: the frame numbers, increasing.
         log: told in a line each what a user should know.
 
@@ -115,7 +113,6 @@ def given_identity(start: InitialPoses, body: BodyModel, remedy: str) -> Identit
     """The identity of fitted poses: beta, Delta J and Delta V_face; the mean's where they have none.
 
     Args:
-        start: the poses.
         body: the body that the coefficients belong to.
         remedy: ends an error's message.
 
@@ -168,10 +165,6 @@ def initial_from_files(
 
     Args:
         start: poses of the observations' frames.
-        body: the body.
-        observations: what the fit aims at.
-        model: the landmarks.
-        views: the cameras.
         log: told in one line each what of the files was not used.
         believe: take the files' place also where the landmarks know a better one.
 
@@ -238,10 +231,8 @@ def _in_world(
     """Rotation vectors [T, 55, 3] and places [T, 3] in the world, of poses in their cameras' axes.
 
     Args:
-        start: the poses.
         transl: [T, 3], metres, their places.
         pivot: [3], metres, the point that the root turns about.
-        views: the cameras.
     """
     orient, placed = into_world(start.rotation[:, 0], transl, pivot, views.rotation, views.translation)
     return torch.cat([orient[:, None].to(start.rotation), start.rotation[:, 1:]], dim=1), placed

@@ -67,11 +67,7 @@ def register(
     """Fit the body to a clip.
 
     Args:
-        body: the body.
-        landmarks: where keypoints lie on it.
         keypoints: detections of T frames.
-        cameras: frame number -> camera.
-        settings: the stage's.
         report: called after each step with a note on the loss.
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.

@@ -113,7 +113,6 @@ def group_means(error: Tensor, observations: Observations) -> dict[str, float]:
 
     Args:
         error: [T, N], pixels, NaN where masked.
-        observations: whose points they are.
     """
     means = {name: error[:, observations.of(name)].nanmean() for name in GROUPS}
     return {name: float(mean) for name, mean in means.items() if torch.isfinite(mean)}
@@ -126,9 +125,7 @@ def write_residuals(path: Path, error: Tensor, observations: Observations) -> No
     the group; ``pixels``, its reprojection error. Masked keypoints have no row.
 
     Args:
-        path: the file.
         error: [T, N], pixels, NaN where masked.
-        observations: whose points they are.
     """
     group = observations.group.numpy()
     within = np.zeros(len(group), np.int32)

@@ -192,7 +192,6 @@ def unseen_azimuths(clip: FittedClip, joints: Tensor) -> tuple[float, tuple[floa
     """The sides of the body that no training frame shows.
 
     Args:
-        clip: the clip.
         joints: [55, 3], rest joints; the first is the pelvis.
 
     Returns:

@@ -50,7 +50,6 @@ def read_amass(path: Path, body: BodyModel, span: Span, up: str = "auto") -> Mot
     """Reads an archive.
 
     Args:
-        path: the .npz.
         body: whose expressions and shapes the numbers may belong to.
         span: which frames are wanted.
         up: the axis that is up in the file: y, z or auto.

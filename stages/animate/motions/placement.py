@@ -59,7 +59,6 @@ def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = 
 
     Args:
         motion: as it was captured.
-        body: the body.
         identity: the person's.
         in_place: the pelvis stays where it is; the body's turns are kept.
     """

@@ -31,8 +31,7 @@ def read_pose_folder(folder: Path, body: BodyModel, body_file: Path, span: Span)
 
     Args:
         folder: holds ``<frame>.json``.
-        body: the body that will be moved.
-        body_file: its file, for the hands' mean.
+        body_file: the body's file, for the hands' mean.
         span: which frames are wanted, counted from the folder's first.
 
     Raises:

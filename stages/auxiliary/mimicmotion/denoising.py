@@ -68,7 +68,6 @@ def denoise(
     """The latent video, frame 0 of which shows the reference's pose.
 
     Args:
-        model: the networks.
         reference: the person, in [-1, 1].
         poses: F skeletons [H, W, 3] uint8, the reference's own first.
         sampling: steps, guidance, tiles, seed.

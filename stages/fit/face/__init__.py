@@ -39,11 +39,9 @@ def fit_face(
     """Fit a face to the clip by the source that ``settings.face`` names.
 
     Args:
-        body: the body.
         landmarks: where the face mesh lies on it.
         keypoints: the clip's detections; their face mesh is read.
         observations: made of the same keypoints; says which face points to trust.
-        views: the cameras.
         settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh`` where the
             estimator gave a face mesh.
         log: told in one line what was fitted, or why nothing was.

@@ -1,6 +1,6 @@
 """The face first from the estimator's 3D face mesh: the default source, which needs no other model.
 
-HeadPoses and expressions of single frames (``frames``) alternate with the clip's neutral face (``neutral``).
+HeadPoses and expressions of single frames (``head_poses``) alternate with the clip's neutral face (``neutral``).
 The neutral face is learnt from at most 96 frames spread over the clip, so that long clips cost no
 more; then every frame is solved once against it. Trusts x and y more than z, and fits how much the
 estimator exaggerates depth.
@@ -35,7 +35,6 @@ def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: CameraBa
         model: the body's face, F points.
         mesh: [T, F, 3], x, y, z of these points in pixels, z relative and larger farther away.
         mask: [T, F] bool, which of them to trust.
-        views: the cameras.
 
     Returns:
         None where no frame shows enough of a face.

@@ -137,10 +137,8 @@ def solve(
     """Gauss-Newton steps on every frame.
 
     Args:
-        model: the face.
         neutral: n, [F, 3], metres.
         sight: what was seen in T frames.
-        heads: where to begin.
         lens: the observations' quality.
         steps: how many.
     """

@@ -52,7 +52,7 @@ def solve_neutral(
     model: FaceModel,
     modes: Modes,
     neutral: Tensor,
-    sight: FaceObservations,
+    seen: FaceObservations,
     heads: HeadPoses,
     lens: FaceNoise,
 ) -> Tensor:
@@ -63,15 +63,14 @@ def solve_neutral(
 
     Args:
         model: the face; modes: its smooth offsets.
-        neutral: the present neutral face, [F, 3].
-        sight, heads, lens: T frames, as in ``frames.solve``.
+        seen, heads, lens: T frames, as in ``head_poses.solve``.
     """
     count = len(model.mean)
     normal, right = neutral.new_zeros(count, 3, 3), neutral.new_zeros(count, 3)
-    for begin in range(0, len(sight.mask), CHUNK):
+    for begin in range(0, len(seen.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
         part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
-        linear = linearise(model, neutral, sight.frames(rows), part, FaceNoise(lens.noise[rows], lens.gain))
+        linear = linearise(model, neutral, seen.frames(rows), part, FaceNoise(lens.noise[rows], lens.gain))
         jacobian = linear.camera @ linear.blend
         weighted = jacobian.mT * (TOGETHER * linear.weight)[..., None, None]
         normal += (weighted @ jacobian).sum(0)
