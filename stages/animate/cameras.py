@@ -78,7 +78,11 @@ def clip_start(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identi
 
 
 def cameras_of(
-    animation: Animation, posed: PosedFrame, settings: AnimateSettings, origin: ClipStart, pelvis: torch.Tensor
+    animation: Animation,
+    posed: PosedFrame,
+    settings: AnimateSettings,
+    origin: ClipStart,
+    pelvis: torch.Tensor,
 ) -> list[Camera]:
     """A camera a frame.
 
@@ -87,10 +91,10 @@ def cameras_of(
         origin: of the person's own clip.
         pelvis: [3], metres, where the pelvis is in the animation's first frame.
     """
-    size, count = (settings.width, settings.height), len(script)
+    size, count = (settings.width, settings.height), len(animation)
     if settings.camera == "clip":
         return [clip_camera(origin, pelvis, *size)] * count
-    if script.still:
+    if animation.still:
         return orbit(visible_extent(posed(0)), *size, count, settings.turns)
     rows = spread_end_to_end(range(count), _SAMPLES)
     boxes = np.stack([visible_box(posed(row)) for row in rows])

@@ -116,6 +116,12 @@ def crop(
     return Cropped(image, cut, trust, view.resized(*size), news)
 
 
+def pixel_map(source: Camera, target: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Scale and shift, [2] each, from the pixels of a camera to those of one with other intrinsics."""
+    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
+    return scale, target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
+
+
 def _box(camera: Camera, points: Tensor) -> Box | None:
     """The box of what the points cover in the picture, with a margin; None where that is too little."""
     if not len(points):

@@ -57,7 +57,7 @@ class PictureDetector:
         self._estimator = Estimator(context.assets["mediapipe"], log, still=True)
         self._faces = FaceRecognizer(context.assets["dlib"], context.assets["identity"])
 
-    def look(self, picture: GeneratedPicture) -> DetectedPicture:
+    def detect(self, picture: GeneratedPicture) -> DetectedPicture:
         """The detections in one frame."""
         height, width = picture.image.shape[:2]
         keypoints, mask, estimate = picture.keypoints, picture.mask, None

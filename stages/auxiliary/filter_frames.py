@@ -17,7 +17,7 @@ from stages.auxiliary import frame_checks
 from stages.auxiliary.detect_generated import DetectedPicture, PictureDetector
 from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
 from stages.auxiliary.register import register
-from stages.auxiliary.skeleton import driven_keypoints
+from stages.auxiliary.skeleton import driven_keypoints, head_facing
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -49,22 +49,22 @@ class FilteredFrames:
 
 
 def take_all(
-    context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput, total: int
+    context: Context, clip: FittedClip, landmarks: Landmarks, output: GeneratorOutput, total: int
 ) -> FilteredFrames:
     """All frames of an output whose pictures show their poses exactly; keypoints are the poses' own."""
     folder, frames, points = _made(context), [], []
     with context.progress(total, "frames") as progress:
-        for picture in offer.pictures:
+        for picture in output.pictures:
             _keep(folder, picture, picture.mask)
-            vertices, joints = pose_frame(clip.body, clip.identity, offer.poses.pose(picture.frame))
-            camera = offer.cameras[picture.frame]
+            vertices, joints = pose_frame(clip.body, clip.identity, output.poses.pose(picture.frame))
+            camera = output.cameras[picture.frame]
             points.append(driven_keypoints(clip, landmarks, joints, vertices, camera))
             frames.append(picture.frame)
             progress.advance()
     return FilteredFrames(
         folder=folder,
-        poses=offer.poses.select(frames),
-        cameras={frame: offer.cameras[frame] for frame in frames},
+        poses=output.poses.select(frames),
+        cameras={frame: output.cameras[frame] for frame in frames},
         keypoints=np.stack(points) if points else np.zeros((0, 133, 3), np.float32),
         offered=len(frames),
         refused={},
@@ -73,35 +73,35 @@ def take_all(
 
 
 def filter_frames(
-    context: Context, clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput
+    context: Context, clip: FittedClip, landmarks: Landmarks, output: GeneratorOutput
 ) -> FilteredFrames:
     """The frames of an output that pass the checks, registered to their keypoints."""
-    settings, folder, watcher = context.settings, _made(context), PictureDetector(context)
-    looks: list[DetectedPicture] = []
-    with context.progress(len(offer.poses), "looking") as progress:
-        for picture in offer.pictures:
-            look = watcher.look(picture)
-            _keep(folder, picture, look.mask)
-            looks.append(dataclasses.replace(look, mask=np.zeros((0, 0), np.uint8)))
+    settings, folder, detector = context.settings, _made(context), PictureDetector(context)
+    detections: list[DetectedPicture] = []
+    with context.progress(len(output.poses), "looking") as progress:
+        for picture in output.pictures:
+            detected = detector.detect(picture)
+            _keep(folder, picture, detected.mask)
+            detections.append(dataclasses.replace(detected, mask=np.zeros((0, 0), np.uint8)))
             progress.advance()
-    driving = _driving(clip, landmarks, offer, looks)
-    subject = watcher.subject(clip)
-    reasons = _first_reasons(looks, driving, subject, settings)
+    driving = _driving(clip, landmarks, output, detections)
+    subject = detector.subject(clip)
+    reasons = _first_reasons(detections, driving, subject, settings)
     left = [row for row, reason in enumerate(reasons) if reason is None]
-    frames = [looks[row].frame for row in left]
-    poses = offer.poses.select(frames)
+    frames = [detections[row].frame for row in left]
+    poses = output.poses.select(frames)
     if settings.register and left:
-        usable = [frame_checks.usable_points(looks[row].keypoints, driving.matched[row]) for row in left]
-        cameras = [offer.cameras[frame] for frame in frames]
+        usable = [frame_checks.usable_points(detections[row].keypoints, driving.matched[row]) for row in left]
+        cameras = [output.cameras[frame] for frame in frames]
         poses = register(clip, landmarks, poses, cameras, np.stack(usable))
     for row in left:
-        frame = looks[row].frame
+        frame = detections[row].frame
         mask = read_mask(folder / "masks", frame)
         vertices = posed_vertices(clip.body, clip.identity, poses.pose(frame))
-        if not frame_checks.mask_fits(clip, vertices, offer.cameras[frame], mask, settings):
+        if not frame_checks.mask_fits(clip, vertices, output.cameras[frame], mask, settings):
             reasons[row] = frame_checks.MASK
     kept = [row for row in left if reasons[row] is None]
-    frames = [looks[row].frame for row in kept]
+    frames = [detections[row].frame for row in kept]
     notes = (
         ()
         if subject is not None
@@ -110,13 +110,13 @@ def filter_frames(
     return FilteredFrames(
         folder=folder,
         poses=poses.select(frames),
-        cameras={frame: offer.cameras[frame] for frame in frames},
-        keypoints=np.stack([looks[row].keypoints for row in kept])
+        cameras={frame: output.cameras[frame] for frame in frames},
+        keypoints=np.stack([detections[row].keypoints for row in kept])
         if kept
         else np.zeros((0, 133, 3), np.float32),
-        offered=len(looks),
+        offered=len(detections),
         refused=dict(sorted(Counter(reason for reason in reasons if reason).items())),
-        identity={looks[row].frame: driving.identity[row] for row in kept},
+        identity={detections[row].frame: driving.identity[row] for row in kept},
         notes=notes,
     )
 
@@ -131,36 +131,35 @@ class _Driving:
 
 
 def _driving(
-    clip: FittedClip, landmarks: Landmarks, offer: GeneratorOutput, looks: list[DetectedPicture]
+    clip: FittedClip, landmarks: Landmarks, output: GeneratorOutput, detections: list[DetectedPicture]
 ) -> _Driving:
     matched, cosines = [], []
-    for look in looks:
-        pose, camera = offer.poses.pose(look.frame), offer.cameras[look.frame]
+    for detected in detections:
+        pose, camera = output.poses.pose(detected.frame), output.cameras[detected.frame]
         vertices, joints = pose_frame(clip.body, clip.identity, pose)
         driven = driven_keypoints(clip, landmarks, joints, vertices, camera)
-        place = frame_checks.mean_place(vertices)
-        cosines.append(frame_checks.head_facing(clip, pose, camera, place))
-        matched.append(frame_checks.match_keypoints(look.keypoints, driven, cosines[-1]))
+        cosines.append(head_facing(clip, pose, camera, vertices.mean(0)))
+        matched.append(frame_checks.match_keypoints(detected.keypoints, driven, cosines[-1]))
     return _Driving(matched, cosines)
 
 
 def _first_reasons(
-    looks: list[DetectedPicture], driving: _Driving, subject: np.ndarray | None, settings
+    detections: list[DetectedPicture], driving: _Driving, subject: np.ndarray | None, settings
 ) -> list[str | None]:
     """The reason for which each frame is refused before it is registered, or None."""
     limit = settings.identity_distance
-    driving.identity, stranger = frame_checks.other_faces(looks, driving.cosines, subject, limit)
-    flickers = frame_checks.flickering(looks, settings.flicker)
+    driving.identity, stranger = frame_checks.other_faces(detections, driving.cosines, subject, limit)
+    flickers = frame_checks.flickering(detections, settings.flicker)
     reasons: list[str | None] = []
-    for row, look in enumerate(looks):
+    for row, detected in enumerate(detections):
         face = driving.identity[row]
-        if not look.found:
+        if not detected.found:
             reasons.append(frame_checks.NOBODY)
         elif stranger or (face is not None and face > limit):
             reasons.append(frame_checks.FACE_OF)
         elif driving.matched[row].distance > settings.keypoint_distance:
             reasons.append(frame_checks.POSE)
-        elif frame_checks.wrong_way(look, driving.cosines[row]):
+        elif frame_checks.wrong_way(detected, driving.cosines[row]):
             reasons.append(frame_checks.AWAY)
         else:
             reasons.append(frame_checks.FLICKER if flickers[row] else None)

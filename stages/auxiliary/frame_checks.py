@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
-from pipeline.body import PARTS, Pose, joint_index, joint_orientations, part_labels, rasterize
+from pipeline.body import PARTS, part_labels, rasterize
 from pipeline.clip.camera import Camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import BODY, FACE
@@ -83,18 +82,6 @@ def usable_points(found: np.ndarray, matched: KeypointMatch) -> np.ndarray:
     return points[MIRRORED] if matched.mirrored else points
 
 
-def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> float:
-    """The cosine between the head's front and the way to the camera.
-
-    Args:
-        pose: of the body.
-        place: [3], where the body is.
-    """
-    front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]
-    view = camera.centre - place
-    return float(front @ view / view.norm())
-
-
 def wrong_way(look: DetectedPicture, cosine: float) -> bool:
     """True if a face is seen where there should be a back of a head, or none where there should be one."""
     seen = float(look.keypoints[FACE, 2].mean()) >= FACE_SCORE
@@ -150,9 +137,3 @@ def flickering(looks: Sequence[DetectedPicture], times: float) -> list[bool]:
     usual = max(float(np.median(steps)), 1e-6)
     before, after = [steps[0], *steps], [*steps, steps[-1]]
     return [min(pair) > times * usual for pair in zip(before, after, strict=True)]
-
-
-def mean_place(vertices: Tensor) -> Tensor:
-    """The middle of the body, [V, 3] -> [3]."""
-    with torch.no_grad():
-        return vertices.mean(0)

@@ -19,7 +19,7 @@ from pipeline.clip.records import write_cameras
 from pipeline.files.json_files import write_json
 from pipeline.pictures import side_by_side
 from pipeline.texture import FineSurface
-from stages.auxiliary.crop import Framing, crop
+from stages.auxiliary.crop import Framing, crop, pixel_map
 from stages.auxiliary.filter_frames import FilteredFrames
 from stages.auxiliary.turntable_motion import ID_OFFSET
 
@@ -112,8 +112,7 @@ def write_records(
 
 def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
     """Keypoints [133, 3] of a picture in a crop of it, those outside with score 0."""
-    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
-    shift = target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
+    scale, shift = pixel_map(source, target)
     placed = points.copy()
     placed[:, :2] = points[:, :2] * scale + shift
     inside = (placed[:, :2] >= 0).all(1) & (placed[:, 0] < target.width) & (placed[:, 1] < target.height)

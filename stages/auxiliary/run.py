@@ -61,11 +61,11 @@ def run(context: Context) -> None:
     if generator == "texture":
         accepted = take_all(context, clip, landmarks, painted(clip, turn, surface, colors), len(turn.poses))
     else:
-        offer = offered(context, generator, clip, turn)
+        output = generated(context, generator, clip, turn)
         if settings.check:
-            accepted = filter_frames(context, clip, landmarks, offer)
+            accepted = filter_frames(context, clip, landmarks, output)
         else:
-            accepted = take_all(context, clip, landmarks, offer, len(offer.poses))
+            accepted = take_all(context, clip, landmarks, output, len(output.poses))
     publish(context, clip, accepted, framing, surface, seen.known)
 
 
@@ -80,7 +80,7 @@ def chosen_generator(context: Context) -> str:
     return "texture" if called_for else "off"
 
 
-def offered(context: Context, generator: str, clip: FittedClip, turn: TurntableMotion) -> GeneratorOutput:
+def generated(context: Context, generator: str, clip: FittedClip, turn: TurntableMotion) -> GeneratorOutput:
     """The frames of ``folder`` or ``mimicmotion``."""
     settings = context.settings
     if generator == "folder":

@@ -13,7 +13,15 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from pipeline.body import Landmarks, locate, pose_frame, rasterize
+from pipeline.body import (
+    Landmarks,
+    Pose,
+    joint_index,
+    joint_orientations,
+    locate,
+    pose_frame,
+    rasterize,
+)
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
@@ -143,3 +151,15 @@ def turntable_keypoints(clip: FittedClip, turn: TurntableMotion, landmarks: Land
         vertices, joints = pose_frame(clip.body, clip.identity, turn.poses.pose(frame))
         found.append(driven_keypoints(clip, landmarks, joints, vertices, turn.camera))
     return np.stack(found)
+
+
+def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> float:
+    """The cosine between the head's front and the way to the camera.
+
+    Args:
+        pose: of the body.
+        place: [3], where the body is.
+    """
+    front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]
+    view = camera.centre - place
+    return float(front @ view / view.norm())

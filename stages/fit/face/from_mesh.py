@@ -1,8 +1,8 @@
 """The face first from the estimator's 3D face mesh: the default source, which needs no other model.
 
-HeadPoses and expressions of single frames (``head_poses``) alternate with the clip's neutral face (``neutral``).
-The neutral face is learnt from at most 96 frames spread over the clip, so that long clips cost no
-more; then every frame is solved once against it. Trusts x and y more than z, and fits how much the
+Heads and expressions of single frames (``head_poses``) alternate with the clip's neutral face
+(``neutral``), which is learnt from at most 96 frames spread over the clip, so that long clips cost no more;
+then every frame is solved once against it. Trusts x and y more than z, and fits how much the
 estimator exaggerates depth.
 """
 
@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from stages.fit.camera_batch import CameraBatch
-from stages.fit.face.head_poses import FaceNoise, FaceObservations, HeadPoses, linearise, solve, start
+from stages.fit.face.head_poses import (
+    FaceObservations,
+    HeadPoses,
+    ObservationQuality,
+    linearise,
+    solve,
+    start,
+)
 from stages.fit.face.neutral import Modes, smooth_modes, solve_neutral
 from stages.fit.face.target import FaceModel, FaceTarget, make_target
 
@@ -39,34 +46,36 @@ def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: CameraBa
     Returns:
         None where no frame shows enough of a face.
     """
-    sight = FaceObservations(mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal)
-    valid = (sight.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * sight.mask[..., None]).all((1, 2))
+    observed = FaceObservations(
+        mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal
+    )
+    valid = (observed.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * observed.mask[..., None]).all((1, 2))
     if not valid.any():
         return None
     rows = torch.nonzero(valid)[:, 0]
     chosen = rows[torch.linspace(0, len(rows) - 1, min(len(rows), _LEARNT_FROM)).round().long()]
-    neutral, lens = _learn(model, smooth_modes(model), sight.frames(chosen))
-    seen = sight.frames(rows)
-    noise = lens.noise.median() / _sizes(sight.frames(chosen)).median() * _sizes(seen)
-    lens = FaceNoise(noise, lens.gain)
-    heads = solve(model, neutral, seen, start(model, seen), lens, steps=4)
-    fits = _misfit(model, neutral, seen, heads, lens) < _MISFIT * _sizes(seen) + _BLUR
+    neutral, quality = _learn(model, smooth_modes(model), observed.frames(chosen))
+    seen = observed.frames(rows)
+    noise = quality.noise.median() / _sizes(observed.frames(chosen)).median() * _sizes(seen)
+    quality = ObservationQuality(noise, quality.gain)
+    heads = solve(model, neutral, seen, start(model, seen), quality, steps=4)
+    fits = _misfit(model, neutral, seen, heads, quality) < _MISFIT * _sizes(seen) + _BLUR
     if not fits.any():
         return None
     return _handed_on(model, neutral, heads, rows, fits, views)
 
 
-def _learn(model: FaceModel, modes: Modes, sight: FaceObservations) -> tuple[Tensor, FaceNoise]:
+def _learn(model: FaceModel, modes: Modes, observed: FaceObservations) -> tuple[Tensor, ObservationQuality]:
     """The neutral face, and the quality of the observations that it was learnt from."""
-    neutral, heads = model.mean, start(model, sight)
-    lens = FaceNoise(_FIRST_NOISE * _sizes(sight))
+    neutral, heads = model.mean, start(model, observed)
+    quality = ObservationQuality(_FIRST_NOISE * _sizes(observed))
     for _ in range(_ROUNDS):
-        heads = solve(model, neutral, sight, heads, lens, steps=2)
-        if len(sight.mask) >= _RESTS_WITHIN:
+        heads = solve(model, neutral, observed, heads, quality, steps=2)
+        if len(observed.mask) >= _RESTS_WITHIN:
             neutral, heads = _at_rest(model, neutral, heads)
-        lens = _quality(model, neutral, sight, heads, lens)
-        neutral = solve_neutral(model, modes, neutral, sight, heads, lens)
-    return neutral, lens
+        quality = _quality(model, neutral, observed, heads, quality)
+        neutral = solve_neutral(model, modes, neutral, observed, heads, quality)
+    return neutral, quality
 
 
 def _at_rest(model: FaceModel, neutral: Tensor, heads: HeadPoses) -> tuple[Tensor, HeadPoses]:
@@ -89,41 +98,49 @@ def densest_half(values: Tensor) -> Tensor:
 
 
 def _quality(
-    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
-) -> FaceNoise:
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+) -> ObservationQuality:
     """Noise as the median says it, in proportion to the face's size, and the gain of depth."""
-    linear = linearise(model, neutral, sight, heads, lens)
-    trusted = sight.mask > 0
-    off = (linear.residual[..., :2] * lens.noise[:, None, None])[trusted].abs() / 0.6745
-    sizes = _sizes(sight)
-    relative = (off / sizes[:, None].expand_as(sight.mask)[trusted][:, None]).median()
+    linear = linearise(model, neutral, observed, heads, quality)
+    trusted = observed.mask > 0
+    off = (linear.residual[..., :2] * quality.noise[:, None, None])[trusted].abs() / 0.6745
+    sizes = _sizes(observed)
+    relative = (off / sizes[:, None].expand_as(observed.mask)[trusted][:, None]).median()
     noise = (relative * sizes).clamp_min(_LEAST_NOISE)
     posed = (linear.posed @ heads.rotation.mT)[..., 2]
-    predicted = posed * (sight.focal[:, :1] / heads.place[:, 2:].clamp_min(0.05))
+    predicted = posed * (observed.focal[:, :1] / heads.place[:, 2:].clamp_min(0.05))
     weight = linear.weight / sizes[:, None].square()
     mean = [
         (v * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-9)
-        for v in (predicted, sight.depth)
+        for v in (predicted, observed.depth)
     ]
-    predicted, found = predicted - mean[0], sight.depth - mean[1]
+    predicted, found = predicted - mean[0], observed.depth - mean[1]
     gain = float((weight * predicted * found).sum() / (weight * predicted.square()).sum().clamp_min(1e-9))
-    return FaceNoise(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
+    return ObservationQuality(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
 
 
 def _misfit(
-    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
 ) -> Tensor:
     """The median distance in pixels between seen and predicted points of each frame: [T]."""
-    linear = linearise(model, neutral, sight, heads, lens)
-    off = (linear.residual[..., :2] * lens.noise[:, None, None]).norm(dim=-1)
-    off = torch.where(sight.mask > 0, off, torch.full_like(off, torch.nan))
+    linear = linearise(model, neutral, observed, heads, quality)
+    off = (linear.residual[..., :2] * quality.noise[:, None, None]).norm(dim=-1)
+    off = torch.where(observed.mask > 0, off, torch.full_like(off, torch.nan))
     return off.nanmedian(dim=1).values
 
 
-def _sizes(sight: FaceObservations) -> Tensor:
+def _sizes(observed: FaceObservations) -> Tensor:
     """The size of each face in pixels, [T]: the spread of its points, depth included."""
-    weight = sight.mask[..., None]
-    places = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
+    weight = observed.mask[..., None]
+    places = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
     total = weight.sum(1).clamp_min(1)
     middle = (places * weight).sum(1) / total
     return ((places - middle[:, None]).square() * weight).sum((1, 2)).div(total[:, 0]).sqrt().clamp_min(1.0)

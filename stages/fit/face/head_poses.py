@@ -77,7 +77,7 @@ class HeadPoses:
 
 
 @dataclasses.dataclass(frozen=True)
-class FaceNoise:
+class ObservationQuality:
     """The quality of the observations.
 
     Attributes:
@@ -108,18 +108,18 @@ class Linearisation:
     posed: Tensor
 
 
-def start(model: FaceModel, sight: FaceObservations) -> HeadPoses:
-    """HeadPoses by Procrustes' fit of the points that neither the jaw nor an expression moves."""
-    weights = sight.mask * rigidity(model)
-    seen = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
+def start(model: FaceModel, observed: FaceObservations) -> HeadPoses:
+    """Heads by Procrustes' fit of the points that neither the jaw nor an expression moves."""
+    weights = observed.mask * rigidity(model)
+    seen = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
     nothing = weights.sum(1) < 1e-6
     weights = torch.where(nothing[:, None], torch.ones_like(weights), weights)
     mean = model.mean.expand(len(seen), -1, -1)
     rotation, shift, scale = roma.rigid_points_registration(mean, seen, weights, compute_scaling=True)
-    distance = sight.focal.mean(1) / scale.clamp_min(1e-3)
+    distance = observed.focal.mean(1) / scale.clamp_min(1e-3)
     centre = (mean * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
     middle = (seen * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
-    ahead = torch.cat([middle[:, :2] / sight.focal * distance[:, None], distance[:, None]], dim=1)
+    ahead = torch.cat([middle[:, :2] / observed.focal * distance[:, None], distance[:, None]], dim=1)
     place = ahead - (rotation @ centre[..., None])[..., 0]
     zeros = seen.new_zeros(len(seen), model.expression.shape[2])
     return HeadPoses(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
@@ -132,29 +132,38 @@ def rigidity(model: FaceModel) -> Tensor:
 
 
 def solve(
-    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise, steps: int
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+    steps: int,
 ) -> HeadPoses:
     """Gauss-Newton steps on every frame.
 
     Args:
         neutral: n, [F, 3], metres.
-        sight: what was seen in T frames.
-        lens: the observations' quality.
+        observed: what was seen in T frames.
+        quality: of the observations.
         steps: how many.
     """
     done = []
-    for begin in range(0, len(sight.mask), CHUNK):
+    for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
         part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
-        seen, quality = sight.frames(rows), FaceNoise(lens.noise[rows], lens.gain)
+        seen, known = observed.frames(rows), ObservationQuality(quality.noise[rows], quality.gain)
         for _ in range(steps):
-            part = _step(model, linearise(model, neutral, seen, part, quality), part, seen, quality)
+            part = _step(model, linearise(model, neutral, seen, part, known), part, known)
         done.append(part)
     return HeadPoses(*(torch.cat([getattr(p, f.name) for p in done]) for f in dataclasses.fields(HeadPoses)))
 
 
 def linearise(
-    model: FaceModel, neutral: Tensor, sight: FaceObservations, heads: HeadPoses, lens: FaceNoise
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
 ) -> Linearisation:
     """Residuals and derivatives; arguments as in ``solve``."""
     turn = roma.rotvec_to_rotmat(_about_x(heads.jaw))  # [T, 3, 3]
@@ -164,14 +173,14 @@ def linearise(
     posed = (blend @ (shaped - model.jaw_joint)[..., None])[..., 0] + model.jaw_joint
     seen = posed @ heads.rotation.mT + heads.place[:, None]
     near = seen[..., 2:].clamp_min(0.05)
-    focal, distance = sight.focal[:, None], heads.place[:, None, 2:].clamp_min(0.05)
+    focal, distance = observed.focal[:, None], heads.place[:, None, 2:].clamp_min(0.05)
     pixels = seen[..., :2] / near * focal
-    per_metre = lens.gain * focal[..., :1] / distance
+    per_metre = quality.gain * focal[..., :1] / distance
     depth = per_metre * (seen[..., 2:] - heads.place[:, None, 2:]) + heads.origin[:, None, None]
-    found = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
-    sigma = torch.stack([lens.noise, lens.noise, DEPTH_NOISE * lens.noise], dim=1)[:, None]
+    found = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
+    sigma = torch.stack([quality.noise, quality.noise, DEPTH_NOISE * quality.noise], dim=1)[:, None]
     residual = (found - torch.cat([pixels, depth], dim=-1)) / sigma
-    weight = sight.mask / (1 + residual.square().mean(-1) / _OUTLIER).square()
+    weight = observed.mask / (1 + residual.square().mean(-1) / _OUTLIER).square()
     camera = seen.new_zeros(*seen.shape, 3)
     camera[..., 0, 0], camera[..., 1, 1] = (focal / near).unbind(-1)
     camera[..., :2, 2] = -pixels / near
@@ -180,10 +189,10 @@ def linearise(
 
 
 def _step(
-    model: FaceModel, linear: Linearisation, heads: HeadPoses, sight: FaceObservations, lens: FaceNoise
+    model: FaceModel, linear: Linearisation, heads: HeadPoses, quality: ObservationQuality
 ) -> HeadPoses:
     """One damped Gauss-Newton step; priors on the jaw and psi are part of the normal equations."""
-    jacobian = _jacobian(model, linear, heads, lens)  # [T, F, 3, P]
+    jacobian = _jacobian(model, linear, heads, quality)  # [T, F, 3, P]
     weighted = jacobian * (TOGETHER * linear.weight)[..., None, None]
     flat = weighted.flatten(1, 2).mT  # [T, P, 3F]
     normal = (flat @ jacobian.flatten(1, 2)).double()
@@ -206,7 +215,9 @@ def _step(
     )
 
 
-def _jacobian(model: FaceModel, linear: Linearisation, heads: HeadPoses, lens: FaceNoise) -> Tensor:
+def _jacobian(
+    model: FaceModel, linear: Linearisation, heads: HeadPoses, quality: ObservationQuality
+) -> Tensor:
     """Derivatives by rotation, place, depth origin, jaw and psi: [T, F, 3, 8 + E]."""
     in_camera = linear.camera @ heads.rotation[:, None]  # by a shift in the head's axes
     axes = torch.eye(3, dtype=in_camera.dtype).expand(*linear.posed.shape, 3)
@@ -215,7 +226,7 @@ def _jacobian(model: FaceModel, linear: Linearisation, heads: HeadPoses, lens: F
     place = linear.camera.clone()
     place[..., 2, :] = 0
     origin = torch.zeros_like(linear.residual)
-    origin[..., 2] = (1 / (DEPTH_NOISE * lens.noise))[:, None]
+    origin[..., 2] = (1 / (DEPTH_NOISE * quality.noise))[:, None]
     swing = torch.linalg.cross(axes[..., 0, :], linear.posed - model.jaw_joint)
     jaw = in_camera @ (model.jaw_weight[:, None] * swing)[..., None]
     # A product a point over all frames: one a point and frame is many times slower.

@@ -15,9 +15,9 @@ from torch import Tensor
 from stages.fit.face.head_poses import (
     CHUNK,
     TOGETHER,
-    FaceNoise,
     FaceObservations,
     HeadPoses,
+    ObservationQuality,
     linearise,
     rigidity,
 )
@@ -52,9 +52,9 @@ def solve_neutral(
     model: FaceModel,
     modes: Modes,
     neutral: Tensor,
-    seen: FaceObservations,
+    observed: FaceObservations,
     heads: HeadPoses,
-    lens: FaceNoise,
+    quality: ObservationQuality,
 ) -> Tensor:
     """The most probable neutral face, given heads, jaws and expressions: [F, 3] -> [F, 3], metres.
 
@@ -63,14 +63,16 @@ def solve_neutral(
 
     Args:
         model: the face; modes: its smooth offsets.
-        seen, heads, lens: T frames, as in ``head_poses.solve``.
+        observed, heads, quality: T frames, as in ``head_poses.solve``.
     """
     count = len(model.mean)
     normal, right = neutral.new_zeros(count, 3, 3), neutral.new_zeros(count, 3)
-    for begin in range(0, len(seen.mask), CHUNK):
+    for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
         part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
-        linear = linearise(model, neutral, seen.frames(rows), part, FaceNoise(lens.noise[rows], lens.gain))
+        linear = linearise(
+            model, neutral, observed.frames(rows), part, ObservationQuality(quality.noise[rows], quality.gain)
+        )
         jacobian = linear.camera @ linear.blend
         weighted = jacobian.mT * (TOGETHER * linear.weight)[..., None, None]
         normal += (weighted @ jacobian).sum(0)
