@@ -190,9 +190,9 @@ def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
 # Rates
 
 
-@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak), 1e30])
+@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak)])
 def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(subject, tmp_path, factor):
-    """Finite ruins (100, 1e4) and overflow (1e30); before, the ruins were published."""
+    """Finite ruins; before, they were published. Rates that overflow are refused as settings."""
     names = ("learning_rate", "plane_learning_rate", "pose_learning_rate")
     rates = {name: factor * getattr(TINY, name) for name in names}
     settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "warm_up": 1, "face": 0.0}

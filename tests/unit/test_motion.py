@@ -248,7 +248,7 @@ def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth,
     np.savez(tmp_path / "objects.npz", poses=np.array([Evil()], object))
     refused(tmp_path / "objects.npz")
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Evil()))
-    refused(tmp_path / "pickle.npz", "no readable npz")
+    refused(tmp_path / "pickle.npz", "npz archive")
     np.savez(tmp_path / "lacks.npz", trans=np.zeros((3, 3)))
     refused(tmp_path / "lacks.npz", "root_orient", "AMASS")
     np.savez(tmp_path / "odd.npz", poses=np.zeros((3, 100)))
