@@ -2,8 +2,8 @@
 
 Holds: docs/results.md, "Auxiliary views", and what issue 18 wants better. A mannequin with a textured back is
 filmed from the front. Its avatar is trained without auxiliary views, with the ``texture`` generator's at
-weights 0.1 and 1, and with the truth's own pictures of all sides at 0.1 and 1 (the ceiling), and compared with
-the truth on the seen side (the pipeline's camera) and on the side that no camera saw (135, 180 and 225
+weights 0.1 and 1, and with the truth's own pictures of all sides at 0.1 and 1 (the ceiling). It is compared
+with the truth on the seen side (the pipeline's camera) and on the side that no camera saw (135, 180 and 225
 degrees), in held-out frames. The fit is the pipeline's own and the same for all. PSNR, SSIM and LPIPS are of
 the person on black in the box around it.
 """

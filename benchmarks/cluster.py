@@ -1,10 +1,10 @@
 """The cost of Ray against doit's ``-n``.
 
-Holds: docs/results.md, "Datasets". Needs the extra ``cluster``. Six small subjects with three stages each, the
-last of which only waits, so that it is not the work that is measured but what starts it: doit with ``-n 2``, a
-batch on a local Ray that it starts by itself, and a batch on a Ray cluster of two one-CPU nodes that already
-runs. All of them begin every stage as a process of its own and have two subjects at a time. Then the same
-again with everything done: the cost of looking at the store.
+Holds: docs/results.md, "Datasets". Needs the extra ``cluster``. Six small subjects with three stages each,
+the last of which only waits, so that it is not the work that is measured but what starts it: doit with
+``-n 2``, a batch on a local Ray that it starts by itself, and a batch on a Ray cluster of two one-CPU nodes
+that already runs. All of them begin every stage as a process of its own and have two subjects at a time. Then
+the same again with everything done: the cost of looking at the store.
 """
 
 from __future__ import annotations

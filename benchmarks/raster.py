@@ -33,10 +33,12 @@ def measure(options: argparse.Namespace, report: frame.Report) -> str:
     rows = report.tables["rows"]
     ours, dense = ([row for row in rows if row["backend"] == name] for name in ("numba", "dense"))
     ratios = [row["x numba"] for row in dense if row["forward_ms"] is not None]
-    peer = f"; dense takes {min(ratios):.2f} to {max(ratios):.2f} times that over {len(ratios)} scenes"
+    peer = ""
+    if ratios:
+        peer = f"; dense takes {min(ratios):.2f} to {max(ratios):.2f} times that over {len(ratios)} scenes"
     last = ours[-1]
     times = f"{last['forward_ms']:.1f} + {last['backward_ms']:.1f} ms"
-    return f"{last['gaussians']} Gaussians at {last['size']}²: {times}{peer if ratios else ''}"
+    return f"{last['gaussians']} Gaussians at {last['size']}²: {times}{peer}"
 
 
 def race(count: int, size: int, repeats: int) -> list[dict[str, object]]:

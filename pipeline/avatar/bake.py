@@ -20,6 +20,7 @@ from pipeline.avatar.head import Head
 from pipeline.avatar.residual import encode, time_code
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
+from pipeline.device import product_dtype
 from pipeline.splat import Gaussians
 
 
@@ -189,7 +190,7 @@ def bake(avatar: Avatar) -> BakedAvatar:
     """
     decoded = avatar.decode()
     surface, features = decoded.surface, decoded.features
-    dtype = torch.bfloat16 if avatar.half_precision else torch.float32
+    dtype = product_dtype(avatar.device, avatar.half_precision)
     heads: list[BakedHead | None] = [None, None]
     if avatar.pose_heads_active:
         heads = [

@@ -164,7 +164,7 @@ def describe_objective(settings: TrainSettings) -> str:
     return "objective: " + ", ".join(found)
 
 
-class Objective:
+class TrainingObjective:
     """The weighted terms of one optimiser step.
 
     Attributes:

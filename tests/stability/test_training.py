@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline import device
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
 from pipeline.clip.frames import frame_path, write_frame, write_mask
@@ -221,7 +222,8 @@ def drift(subject, tmp_path, count, **settings):
     return np.array(taken), held_out_psnr(trainer, trainer.data.clip.split.test)
 
 
-def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
+def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path, monkeypatch):
+    monkeypatch.setattr(device, "multiplies_bfloat16", lambda device: True)
     half, single = (
         drift(subject, tmp_path / name, 6, half_precision=name == "half") for name in ("half", "single")
     )
