@@ -16,8 +16,8 @@ from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
 from pipeline.splat import Gaussians, render
-from stages.animate.actor import Known, legs_share
-from stages.animate.layers import decode_srgb, layers_of
+from stages.animate.actor import PoseRange, legs_share
+from stages.animate.exr_layers import decode_srgb, exr_layers
 from stages.animate.run import on_background
 from tests.exr_reader import ffmpeg_colors, read_exr
 from tests.ply_reader import read_ply
@@ -158,7 +158,7 @@ def test_layers_of_two_flat_discs_by_hand():
         torch.full((2,), 0.95),
     )  # fmt: skip
     camera = facing_camera(80, 40, 60.0)
-    layers = layers_of(discs, torch.tensor([4, 7]), camera, render(discs, camera))
+    layers = exr_layers(discs, torch.tensor([4, 7]), camera, render(discs, camera))
     pixels = [(20, 25), (20, 47)]  # columns 40 - 0.5 * 60 / 2 and 40 + 0.5 * 60 / 4
     for (row, column), color, depth, part, angle in zip(
         pixels, colors, (2.0, 4.0), (5, 8), (0.0, 0.6), strict=True
@@ -261,7 +261,7 @@ def test_the_unseen_body_can_be_shown_in_its_base_colours(half, walk, baking):
 
 def test_heads_are_told_of_poses_that_training_showed():
     poses = moving_poses()
-    known = Known.of(poses, poses.frames[:-1])
+    known = PoseRange.of(poses, poses.frames[:-1])
     pose = poses.pose(poses.frames[2])
     inside, far = pose_features(pose.rotation), pose.rotation.clone()
     assert torch.equal(known.nearest(pose), inside)

@@ -1,4 +1,4 @@
-"""Which generated frames are fit to learn from; each refusal has a reason that is counted.
+"""Checks of generated frames; each refusal has a reason that is counted.
 
 Two looks at the whole sequence come first: if most of its frontal faces are another person's, all of it
 is; and what is usual from frame to frame says what flickers.
@@ -11,15 +11,14 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
-from pipeline.body import PARTS, Pose, joint_index, joint_orientations, part_labels, rasterize
+from pipeline.body import PARTS, part_labels, rasterize
 from pipeline.clip.camera import Camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import BODY, FACE
 from pipeline.metrics.face_identity import identity_distance
-from stages.auxiliary.look import Look
+from stages.auxiliary.detect_generated import DetectedPicture
 from stages.auxiliary.register import MIRRORED, POINTS, TRUSTED
 from stages.auxiliary.settings import AuxiliarySettings
 
@@ -39,7 +38,7 @@ LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg", "head", "face", "tors
 
 
 @dataclasses.dataclass(frozen=True)
-class Matched:
+class KeypointMatch:
     """A frame's keypoints against the driving ones.
 
     Attributes:
@@ -52,7 +51,7 @@ class Matched:
     mirrored: bool
 
 
-def match(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> Matched:
+def match_keypoints(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> KeypointMatch:
     """Compare [133, 3] keypoints with the driving pose's [133, 3].
 
     Args:
@@ -63,11 +62,11 @@ def match(found: np.ndarray, driven: np.ndarray, cosine: float = -1.0) -> Matche
     body, there = found[BODY], driven[BODY]
     inside = driven[BODY, 2] > 0
     if inside.sum() < 4:
-        return Matched(np.inf, False)
+        return KeypointMatch(np.inf, False)
     height = max(1.0, float(np.ptp(there[inside, 1])), float(np.ptp(there[inside, 0])))
     straight = _distance(body, there)
     exchanged = _distance(body[MIRRORED[:17]], there) if cosine < 0 else np.inf
-    return Matched(min(straight, exchanged) / height, exchanged < 0.7 * straight)
+    return KeypointMatch(min(straight, exchanged) / height, exchanged < 0.7 * straight)
 
 
 def _distance(found: np.ndarray, driven: np.ndarray) -> float:
@@ -77,28 +76,14 @@ def _distance(found: np.ndarray, driven: np.ndarray) -> float:
     return float(np.linalg.norm(found[both, :2] - driven[both, :2], axis=1).mean())
 
 
-def usable_points(found: np.ndarray, matched: Matched) -> np.ndarray:
+def usable_points(found: np.ndarray, matched: KeypointMatch) -> np.ndarray:
     """The points that a registration may use, left and right as the driving pose has them: [23, 3]."""
     points = found[POINTS]
     return points[MIRRORED] if matched.mirrored else points
 
 
-def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> float:
-    """The cosine between the head's front and the way to the camera.
-
-    Args:
-        clip: the body.
-        pose: of the body.
-        camera: the view.
-        place: [3], where the body is.
-    """
-    front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]
-    view = camera.centre - place
-    return float(front @ view / view.norm())
-
-
-def wrong_way(look: Look, cosine: float) -> bool:
-    """Whether a face is seen where there should be a back of a head, or none where there should be one."""
+def wrong_way(look: DetectedPicture, cosine: float) -> bool:
+    """True if a face is seen where there should be a back of a head, or none where there should be one."""
     seen = float(look.keypoints[FACE, 2].mean()) >= FACE_SCORE
     return (cosine > TOWARDS and not seen) or (cosine < BACKWARD and seen)
 
@@ -106,7 +91,7 @@ def wrong_way(look: Look, cosine: float) -> bool:
 def mask_fits(
     clip: FittedClip, vertices: Tensor, camera: Camera, mask: np.ndarray, settings: AuxiliarySettings
 ) -> bool:
-    """Whether a mask covers every limb that should be seen and not much beside the body."""
+    """True if a mask covers every limb that should be seen and not much beside the body."""
     raster = rasterize(camera, vertices, clip.body.faces)
     body, person = raster.covered, mask > 127
     area = int(body.sum())
@@ -127,7 +112,7 @@ def mask_fits(
 
 
 def other_faces(
-    looks: Sequence[Look], cosines: Sequence[float], subject: np.ndarray | None, limit: float
+    looks: Sequence[DetectedPicture], cosines: Sequence[float], subject: np.ndarray | None, limit: float
 ) -> tuple[list[float | None], bool]:
     """Each frame's distance from the subject's face, and whether most of the frontal ones are too far.
 
@@ -141,7 +126,7 @@ def other_faces(
     return distances, bool(known) and float(np.median(known)) > limit
 
 
-def flickering(looks: Sequence[Look], times: float) -> list[bool]:
+def flickering(looks: Sequence[DetectedPicture], times: float) -> list[bool]:
     """Frames that differ from both neighbours by more than ``times`` what is usual."""
     if len(looks) < 4:
         return [False] * len(looks)
@@ -152,9 +137,3 @@ def flickering(looks: Sequence[Look], times: float) -> list[bool]:
     usual = max(float(np.median(steps)), 1e-6)
     before, after = [steps[0], *steps], [*steps, steps[-1]]
     return [min(pair) > times * usual for pair in zip(before, after, strict=True)]
-
-
-def mean_place(vertices: Tensor) -> Tensor:
-    """The middle of the body, [V, 3] -> [3]."""
-    with torch.no_grad():
-        return vertices.mean(0)

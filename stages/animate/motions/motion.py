@@ -7,15 +7,17 @@ import dataclasses
 import numpy as np
 from torch import Tensor
 
+from pipeline.body import BodyModel, Identity, joint_index, mean_identity, rest_joints
 from pipeline.errors import UserError
 
 USUAL_FPS = 30.0
 MOST_FRAMES = 200_000
+_LEG = ("left_hip", "left_knee", "left_ankle")
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """What a body does, T frames, float32. The world is Y up; a body that is not turned faces +Z.
+    """A body's motion, T frames, float32. The world is Y up; a body that is not turned faces +Z.
 
     Attributes:
         name: of the file, for people.
@@ -50,7 +52,7 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Span:
-    """Which frames of a source are wanted, and how often a second.
+    """The frames of a source that are wanted, and their rate.
 
     Attributes:
         first, last: numbers of frames in the source, both included; -1 is the last there is.
@@ -90,3 +92,15 @@ class Span:
         if len(rows) > MOST_FRAMES:
             raise UserError(f"{name}: {len(rows)} frames are too many; choose some with animate.last_frame")
         return rows, fps
+
+
+def leg_length(body: BodyModel, betas: Tensor | None = None, identity: Identity | None = None) -> float:
+    """From the left hip by the knee to the ankle at rest, metres: of an identity, a shape, or the mean."""
+    if identity is None:
+        identity = mean_identity(body)
+        if betas is not None:
+            known = body.shape_directions.shape[2]
+            identity = dataclasses.replace(identity, betas=betas[:known])
+    joints = rest_joints(body, identity)
+    hip, knee, ankle = (joints[joint_index(name)] for name in _LEG)
+    return float((hip - knee).norm() + (knee - ankle).norm())

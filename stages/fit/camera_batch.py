@@ -12,7 +12,7 @@ from pipeline.clip.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
-class Views:
+class CameraBatch:
     """A pinhole a frame; conventions as in ``pipeline.clip.camera``.
 
     Attributes:
@@ -29,9 +29,9 @@ class Views:
     centre: Tensor
     size: Tensor
 
-    def rows(self, rows: slice) -> Views:
+    def rows(self, rows: slice) -> CameraBatch:
         """The cameras of some frames."""
-        return Views(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+        return CameraBatch(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
     def to_camera(self, points: Tensor) -> Tensor:
         """World points in the camera's axes: [T, N, 3] -> [T, N, 3], metres."""
@@ -50,10 +50,10 @@ class Views:
         return in_camera[..., :2] / depth * self.focal[:, None] + self.centre[:, None]
 
 
-def stack(cameras: Sequence[Camera]) -> Views:
+def stack(cameras: Sequence[Camera]) -> CameraBatch:
     """The cameras of T frames as one batch, float32."""
     intrinsics = torch.stack([camera.intrinsics for camera in cameras]).float()
-    return Views(
+    return CameraBatch(
         rotation=torch.stack([camera.rotation for camera in cameras]).float(),
         translation=torch.stack([camera.translation for camera in cameras]).float(),
         focal=intrinsics[:, [0, 1], [0, 1]],

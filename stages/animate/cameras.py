@@ -1,4 +1,4 @@
-"""What is shown, frame by frame: a pose and a camera each."""
+"""A camera for every frame of an animation."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.frames import spread_end_to_end
-from pipeline.motion.motion import Motion
-from pipeline.motion.placement import Placed
 from pipeline.orbit_cameras import extent_of, front_camera, orbit, relaxed_pose, visible_box, visible_extent
 from pipeline.splat import Gaussians
+from stages.animate.motions.motion import Motion
+from stages.animate.motions.placement import PlacedMotion
 from stages.animate.settings import AnimateSettings
 
 _SAMPLES = 24  # frames that are looked at to place a camera
@@ -24,8 +24,8 @@ PosedFrame = Callable[[int], Gaussians]
 
 
 @dataclasses.dataclass(frozen=True)
-class Script:
-    """What is shown.
+class Animation:
+    """The poses that are shown, frame by frame.
 
     Attributes:
         placed: a pose a frame.
@@ -35,7 +35,7 @@ class Script:
         motion: what it was read from; None for a turntable.
     """
 
-    placed: Placed
+    placed: PlacedMotion
     numbers: tuple[int, ...]
     fps: float
     still: bool = False
@@ -46,8 +46,8 @@ class Script:
 
 
 @dataclasses.dataclass(frozen=True)
-class Origin:
-    """How the person's own clip began.
+class ClipStart:
+    """The person's place in the first frame of the own clip.
 
     Attributes:
         camera: of its first frame.
@@ -58,41 +58,43 @@ class Origin:
     pelvis: torch.Tensor
 
 
-def turntable(body: BodyModel, identity: Identity, settings: AnimateSettings) -> Script:
+def turntable(body: BodyModel, identity: Identity, settings: AnimateSettings) -> Animation:
     """The avatar stands still, in the T pose of the paper's supplement or with its arms lowered."""
     count = settings.turntable_frames
-    placed = Placed(
+    placed = PlacedMotion(
         rotation=relaxed_pose(settings.arm_angle).expand(count, -1, -1),
         expression=torch.zeros(count, body.expression_directions.shape[2]),
         transl=-rest_joints(body, identity)[0].expand(count, 3),
         scale=1.0,
     )
-    return Script(placed, tuple(range(count)), settings.turntable_fps, still=True)
+    return Animation(placed, tuple(range(count)), settings.turntable_fps, still=True)
 
 
-def origin_of(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identity: Identity) -> Origin:
-    """Where the person and the camera were in the clip's first frame."""
+def clip_start(poses: Poses, cameras: dict[int, Camera], body: BodyModel, identity: Identity) -> ClipStart:
+    """The camera and the person's place in the clip's first frame."""
     camera = cameras[poses.frames[0]]
     pelvis = rest_joints(body, identity)[0] + poses.transl[0]
-    return Origin(camera, camera.rotation @ pelvis + camera.translation)
+    return ClipStart(camera, camera.rotation @ pelvis + camera.translation)
 
 
 def cameras_of(
-    script: Script, posed: PosedFrame, settings: AnimateSettings, origin: Origin, pelvis: torch.Tensor
+    animation: Animation,
+    posed: PosedFrame,
+    settings: AnimateSettings,
+    origin: ClipStart,
+    pelvis: torch.Tensor,
 ) -> list[Camera]:
     """A camera a frame.
 
     Args:
-        script: what is shown.
-        posed: makes Gaussians of its frames.
-        settings: the stage's.
+        posed: makes Gaussians of the animation's frames.
         origin: of the person's own clip.
-        pelvis: [3], metres, where the pelvis is in the script's first frame.
+        pelvis: [3], metres, where the pelvis is in the animation's first frame.
     """
-    size, count = (settings.width, settings.height), len(script)
+    size, count = (settings.width, settings.height), len(animation)
     if settings.camera == "clip":
         return [clip_camera(origin, pelvis, *size)] * count
-    if script.still:
+    if animation.still:
         return orbit(visible_extent(posed(0)), *size, count, settings.turns)
     rows = spread_end_to_end(range(count), _SAMPLES)
     boxes = np.stack([visible_box(posed(row)) for row in rows])
@@ -101,7 +103,7 @@ def cameras_of(
     return [front_camera(boxes, *size)] * count
 
 
-def clip_camera(origin: Origin, pelvis: torch.Tensor, width: int, height: int) -> Camera:
+def clip_camera(origin: ClipStart, pelvis: torch.Tensor, width: int, height: int) -> Camera:
     """The clip's first camera before the motion, in whose axes it looks level along -Z.
 
     Args:

@@ -1,4 +1,4 @@
-"""What is seen in generated frames: keypoints, a mask, whose face it is, and a small copy for flicker."""
+"""Detections in generated frames: keypoints, a mask, the face's embedding, and a thumbnail for flicker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.clip.keypoints import FACE
 from pipeline.detection.mediapipe import Estimate, Estimator, resize
 from pipeline.detection.wholebody import to_keypoints, to_pixels
 from pipeline.metrics.face_identity import FaceRecognizer, medoid
-from stages.auxiliary.offer import Picture
+from stages.auxiliary.generator_output import GeneratedPicture
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -28,7 +28,7 @@ _SURE = 1e-3  # segmentations are kept this far from 0 and 1 before logarithms a
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class DetectedPicture:
     """One generated frame.
 
     Attributes:
@@ -48,8 +48,8 @@ class Look:
     thumb: np.ndarray
 
 
-class Watcher:
-    """Looks at generated frames, each by itself."""
+class PictureDetector:
+    """Detects the person in generated frames, each by itself."""
 
     def __init__(self, context: Context) -> None:
         """Load the estimator and the face reader."""
@@ -57,8 +57,8 @@ class Watcher:
         self._estimator = Estimator(context.assets["mediapipe"], log, still=True)
         self._faces = FaceRecognizer(context.assets["dlib"], context.assets["identity"])
 
-    def look(self, picture: Picture) -> Look:
-        """What is seen in one frame."""
+    def detect(self, picture: GeneratedPicture) -> DetectedPicture:
+        """The detections in one frame."""
         height, width = picture.image.shape[:2]
         keypoints, mask, estimate = picture.keypoints, picture.mask, None
         if keypoints is None or mask is None:
@@ -68,7 +68,7 @@ class Watcher:
             keypoints = _keypoints(picture.frame, estimate, width, height)
         if mask is None:
             mask = fused(estimate, width, height)
-        return Look(
+        return DetectedPicture(
             frame=picture.frame,
             keypoints=keypoints,
             found=bool((keypoints[:17, 2] > 0.3).sum() >= 4 and (mask > 127).any()),

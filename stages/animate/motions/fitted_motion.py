@@ -1,4 +1,4 @@
-"""What another subject does in its clip, as a motion."""
+"""The motion of another subject, as it was fitted to its clip."""
 
 from __future__ import annotations
 
@@ -13,14 +13,7 @@ from pipeline.body import JOINT_NAMES, BodyModel, read_identity, read_poses, res
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import read_cameras, read_footage
 from pipeline.errors import UserError
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import USUAL_FPS, Motion, Span
-
-READ = {
-    "ingest": ("footage.json", "cameras.parquet"),
-    "fit": ("identity.safetensors", "poses.parquet"),
-}
-"""What is read of the other subject: stage -> files."""
+from stages.animate.motions.motion import USUAL_FPS, Motion, Span, leg_length
 
 
 def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: Span) -> Motion:
@@ -30,7 +23,7 @@ def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: S
 
     Args:
         name: of the other subject.
-        folders: of its ingest and fit, see ``READ``.
+        folders: of its ingest and fit, see ``source.SUBJECT_FILES``.
         body: the body that both were fitted with.
         span: which of its kept frames are wanted, counted from the first.
 
@@ -55,7 +48,7 @@ def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: S
         rotation=rotation,
         expression=poses.expression[rows],
         root=pelvis @ turn.mT,
-        leg=leg_of(body, identity=identity),
+        leg=leg_length(body, identity=identity),
         told=JOINT_NAMES,
         faces_camera=True,
         notes=() if own_fps else (f"{name}'s clip has no clock: {USUAL_FPS:g} frames a second are taken",),

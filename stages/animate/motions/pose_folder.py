@@ -10,13 +10,19 @@ import torch
 from pipeline.body import JOINT_NAMES, BodyModel
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import MOST_FRAMES, USUAL_FPS, Motion, Span
-from pipeline.pose_files import InitialPoses, into_world, on_frames, read_known_poses, with_flat_hands
-from pipeline.pose_files.coefficients import is_official_smplx, knows_coefficients
+from pipeline.pose_files import (
+    InitialPoses,
+    into_world,
+    is_official_smplx,
+    knows_coefficients,
+    on_frames,
+    read_known_poses,
+    with_flat_hands,
+)
+from stages.animate.motions.motion import MOST_FRAMES, USUAL_FPS, Motion, Span, leg_length
 
 
-def read_peers(folder: Path, body: BodyModel, body_file: Path, span: Span) -> Motion:
+def read_pose_folder(folder: Path, body: BodyModel, body_file: Path, span: Span) -> Motion:
     """Reads a folder such as ``smplx_init`` or ``smplx_optimized/smplx_params``.
 
     The parameters are in each frame's camera; one that stands still and looks level is assumed. Frames that
@@ -25,8 +31,7 @@ def read_peers(folder: Path, body: BodyModel, body_file: Path, span: Span) -> Mo
 
     Args:
         folder: holds ``<frame>.json``.
-        body: the body that will be moved.
-        body_file: its file, for the hands' mean.
+        body_file: the body's file, for the hands' mean.
         span: which frames are wanted, counted from the folder's first.
 
     Raises:
@@ -56,7 +61,7 @@ def read_peers(folder: Path, body: BodyModel, body_file: Path, span: Span) -> Mo
         rotation=torch.cat([orient[:, None], poses.rotation[rows][:, 1:].float()], 1),
         expression=None if expression is None else expression[rows].float(),
         root=root,
-        leg=leg_of(body, betas=poses.betas if is_official_smplx(body) else None),
+        leg=leg_length(body, betas=poses.betas if is_official_smplx(body) else None),
         told=JOINT_NAMES,
         faces_camera=True,
         notes=tuple(notes),

@@ -18,16 +18,15 @@ from pipeline.body import (
     rest_joints,
     rest_vertices,
 )
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import Motion
 from pipeline.motion.retarget import yaw
+from stages.animate.motions.motion import Motion, leg_length
 
 _CHUNK = 64  # frames that are posed at once, which bounds the memory
 _FEET = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
 
 @dataclasses.dataclass(frozen=True)
-class Placed:
+class PlacedMotion:
     """A motion of one person in the world, T frames, float32. Y is up, the ground is y = 0.
 
     Attributes:
@@ -50,7 +49,7 @@ class Placed:
         return Pose(self.rotation[row], self.expression[row], self.transl[row])
 
 
-def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = False) -> Placed:
+def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = False) -> PlacedMotion:
     """Gives a motion to a person.
 
     Rotations are kept as they are. The pelvis' way is scaled by the ratio of the legs' lengths, so that feet
@@ -60,11 +59,10 @@ def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = 
 
     Args:
         motion: as it was captured.
-        body: the body.
         identity: the person's.
         in_place: the pelvis stays where it is; the body's turns are kept.
     """
-    rotation, scale = motion.rotation.clone(), leg_of(body, identity=identity) / motion.leg
+    rotation, scale = motion.rotation.clone(), leg_length(body, identity=identity) / motion.leg
     way = (motion.root - motion.root[:1]) * scale
     if not motion.faces_camera:
         turn = yaw(roma.rotvec_to_rotmat(rotation[0, 0])).mT
@@ -79,7 +77,7 @@ def place(motion: Motion, body: BodyModel, identity: Identity, in_place: bool = 
     if motion.expression is not None:
         width = min(known, motion.expression.shape[1])
         expression[:, :width] = motion.expression[:, :width]
-    return Placed(rotation, expression, transl, scale)
+    return PlacedMotion(rotation, expression, transl, scale)
 
 
 @torch.no_grad()

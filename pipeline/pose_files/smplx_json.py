@@ -1,4 +1,4 @@
-"""Reading a folder of SMPL-X parameters, ``<frame>.json`` each, as poses to start from."""
+"""Reading a folder of SMPL-X parameters, ``<frame>.json`` each."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
-from pipeline.pose_files.axes import HAND_JOINTS
+from pipeline.pose_files.camera_frame import HAND_JOINTS
+from pipeline.pose_files.initial_poses import InitialPoses, on_frames
 
 _ROTATIONS = {  # name -> numbers, in the order of the schema's joints
     "root_pose": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3,
@@ -31,45 +30,7 @@ _MEGABYTE = 1 << 20  # a frame's parameters are some 5 kB
 _REMEDY = "name the folder of SMPLest-X's smplx_init/<frame>.json, or leave fit.pose_init empty"
 
 
-@dataclasses.dataclass(frozen=True)
-class InitialPoses:
-    """Poses of a clip as another program estimated them.
-
-    Attributes:
-        frames: the T frame numbers.
-        rotation: [T, 55, 3], rotation vectors, radians, in the order of the schema. The root's is in
-            the axes of the frame's camera (``pose_files.axes``); the hands' are relative to flat hands.
-        expression: [T, E], in the units of the program's own SMPL-X, or None.
-        betas: [B], likewise, the median over the clip, or None.
-        transl: [T, 3], the files' ``trans``, metres in the camera's axes, or None.
-        valid: [T] bool, whether the frame had a usable file. The others are interpolated.
-        pivot: [3], the root joint at rest of the body that the poses were made with, metres, which
-            ``transl`` is relative to; None means that of the body which is posed by them.
-        hands: what the hands are relative to: ``flat`` hands, or the ``mean`` of the body's file.
-        hand_pca: [T, 2, P], left then right, coefficients of the components of SMPL-X's hands, which add
-            to ``rotation``; or None.
-        model: whose coefficients ``betas`` and ``expression`` are: ``smplx``, ``smpl``, or a body's
-            digest.
-        fitted: whether they were fitted to the clip, and not estimated frame by frame.
-        joint_offset, face_offset: [55, 3] and [V, 3], metres, of a fitted identity, or None.
-    """
-
-    frames: tuple[int, ...]
-    rotation: Tensor
-    expression: Tensor | None
-    betas: Tensor | None
-    transl: Tensor | None
-    valid: Tensor
-    pivot: Tensor | None = None
-    hands: str = "flat"
-    hand_pca: Tensor | None = None
-    model: str = "smplx"
-    fitted: bool = False
-    joint_offset: Tensor | None = None
-    face_offset: Tensor | None = None
-
-
-def read_initial_poses(
+def read_smplx_json(
     folder: Path,
     frames: Sequence[int],
     hand_mean: Tensor,
@@ -109,7 +70,7 @@ def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> Initi
         Poses of the frames whose file is usable, float64.
 
     Raises:
-        UserError: as ``read_initial_poses``.
+        UserError: as ``read_smplx_json``.
     """
     paths = _by_frame(folder)
     wanted = list(paths) if frames is None else list(frames)
@@ -129,64 +90,6 @@ def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> Initi
         valid=torch.ones(len(usable), dtype=torch.bool),
         hands="mean",
     )
-
-
-def on_frames(poses: InitialPoses, frames: Sequence[int]) -> InitialPoses:
-    """The poses of other frames, float32: those that are not known come from their neighbours.
-
-    Args:
-        poses: of at least one frame.
-        frames: the T frame numbers, increasing.
-    """
-    rows = {frame: row for row, frame in enumerate(poses.frames) if bool(poses.valid[row])}
-    known = torch.tensor([frame in rows for frame in frames])
-    if not known.any():
-        nearest = min(rows, key=lambda frame: abs(frame - frames[0]))
-        chosen = torch.tensor([rows[nearest]] * len(frames))
-        filled = _each(poses, lambda values: values[chosen], lambda values: values[chosen])
-    else:
-        chosen = torch.tensor([rows[frame] for frame in frames if frame in rows])
-        times = torch.tensor(list(frames), dtype=torch.float64)
-        filled = _each(
-            poses,
-            lambda values: _turned_between(values[chosen], times, known),
-            lambda values: _between(values[chosen].flatten(1), times, known).unflatten(1, values.shape[1:]),
-        )
-    betas = None if poses.betas is None else poses.betas.float()
-    return dataclasses.replace(poses, **filled, frames=tuple(frames), valid=known, betas=betas)
-
-
-def _each(
-    poses: InitialPoses, turned: Callable[[Tensor], Tensor], moved: Callable[[Tensor], Tensor]
-) -> dict[str, Any]:
-    """What every frame has, after one function for rotations and one for the rest."""
-    vectors = {name: getattr(poses, name) for name in ("expression", "transl", "hand_pca")}
-    found = {name: None if one is None else moved(one.double()).float() for name, one in vectors.items()}
-    return {"rotation": turned(poses.rotation.double()).float(), **found}
-
-
-def read_hand_mean(body_file: Path) -> Tensor:
-    """The hand pose that a body file's hands are relative to in parameter files: [30, 3], radians.
-
-    It belongs to the model that the parameters were made with. The open body's own is a relaxed hand as
-    SMPL-X's is, but not the same: with it, estimates for the official model start with fingers that are
-    a few tenths of a radian too straight. Zero if the file has none.
-
-    Raises:
-        UserError: the file cannot be read, or holds something else under these names.
-    """
-    remedy = "use data/body/open_body.npz or a SMPL-X model file"
-    try:
-        with np.load(body_file, allow_pickle=False) as archive:
-            names = ("hands_meanl", "hands_meanr")
-            if not all(name in archive.files for name in names):
-                return torch.zeros(30, 3)
-            means = np.concatenate([np.asarray(archive[name], np.float32).reshape(15, 3) for name in names])
-    except (OSError, EOFError, ValueError, TypeError, AttributeError, BadZipFile) as error:
-        raise UserError(f"{body_file}: its mean hand pose cannot be read ({error}): {remedy}") from None
-    if not np.isfinite(means).all():
-        raise UserError(f"{body_file}: its mean hand pose is not finite: {remedy}")
-    return torch.from_numpy(means)
 
 
 def _by_frame(folder: Path) -> dict[int, Path]:
@@ -271,37 +174,3 @@ def _vectors(name: str, usable: dict[int, dict[str, np.ndarray]], paths: dict[in
             found = f"{len(arrays[name])} numbers in {name}, {paths[first].name} {length}"
             raise UserError(f"{paths[frame]} has {found}: all frames must come from one program")
     return torch.from_numpy(np.stack([arrays[name] for arrays in usable.values()]))
-
-
-def _neighbours(times: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """For each of T frames the known ones around it, and how far it is from the first to the second.
-
-    Returns:
-        left and right [T], indices among the known frames, and share [T] in [0, 1], zero where both are
-        the same frame.
-    """
-    have = times[known]
-    right = torch.searchsorted(have, times).clamp_max(len(have) - 1)
-    left = torch.where(have[right] > times, (right - 1).clamp_min(0), right)
-    length = have[right] - have[left]
-    share = torch.where(length > 0, (times - have[left]) / length.clamp_min(1), torch.zeros_like(length))
-    return left, right, share
-
-
-def _between(values: Tensor, times: Tensor, known: Tensor) -> Tensor:
-    """Values of the N known frames, interpolated over all: [N, K] -> [T, K]."""
-    left, right, share = _neighbours(times, known)
-    return torch.lerp(values[left], values[right], share[:, None])
-
-
-def _turned_between(rotation: Tensor, times: Tensor, known: Tensor) -> Tensor:
-    """Rotation vectors of the N known frames along shortest arcs: [N, J, 3] -> [T, J, 3].
-
-    Those of the known frames come back as they were.
-    """
-    left, right, share = _neighbours(times, known)
-    start, end = (roma.rotvec_to_unitquat(rotation[rows]) for rows in (left, right))
-    arc = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), end), shortest_arc=True)
-    step = roma.rotvec_to_unitquat(arc * share[:, None, None])
-    turned = roma.unitquat_to_rotvec(roma.quat_product(start, step))
-    return torch.where((share > 0)[:, None, None], turned, rotation[left])

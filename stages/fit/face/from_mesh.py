@@ -1,8 +1,8 @@
 """The face first from the estimator's 3D face mesh: the default source, which needs no other model.
 
-Heads and expressions of single frames (``frames``) alternate with the clip's neutral face (``neutral``).
-The neutral face is learnt from at most 96 frames spread over the clip, so that long clips cost no
-more; then every frame is solved once against it. Trusts x and y more than z, and fits how much the
+Heads and expressions of single frames (``head_poses``) alternate with the clip's neutral face
+(``neutral``), which is learnt from at most 96 frames spread over the clip, so that long clips cost no more;
+then every frame is solved once against it. Trusts x and y more than z, and fits how much the
 estimator exaggerates depth.
 """
 
@@ -13,10 +13,17 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from stages.fit.face.frames import Heads, Lens, Sight, linearise, solve, start
+from stages.fit.camera_batch import CameraBatch
+from stages.fit.face.head_poses import (
+    FaceObservations,
+    HeadPoses,
+    ObservationQuality,
+    linearise,
+    solve,
+    start,
+)
 from stages.fit.face.neutral import Modes, smooth_modes, solve_neutral
 from stages.fit.face.target import FaceModel, FaceTarget, make_target
-from stages.fit.views import Views
 
 _LEARNT_FROM = 96  # frames
 _ROUNDS = 4  # of heads, then neutral
@@ -28,49 +35,50 @@ _MISFIT, _BLUR = 0.2, 1.0  # of the face's size, and pixels: a frame that fits n
 _GAIN = (0.6, 1.6)
 
 
-def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: Views) -> FaceTarget | None:
+def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: CameraBatch) -> FaceTarget | None:
     """Fit a face to the estimator's face meshes.
 
     Args:
         model: the body's face, F points.
         mesh: [T, F, 3], x, y, z of these points in pixels, z relative and larger farther away.
         mask: [T, F] bool, which of them to trust.
-        views: the cameras.
 
     Returns:
         None where no frame shows enough of a face.
     """
-    sight = Sight(mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal)
-    valid = (sight.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * sight.mask[..., None]).all((1, 2))
+    observed = FaceObservations(
+        mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal
+    )
+    valid = (observed.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * observed.mask[..., None]).all((1, 2))
     if not valid.any():
         return None
     rows = torch.nonzero(valid)[:, 0]
     chosen = rows[torch.linspace(0, len(rows) - 1, min(len(rows), _LEARNT_FROM)).round().long()]
-    neutral, lens = _learn(model, smooth_modes(model), sight.frames(chosen))
-    seen = sight.frames(rows)
-    noise = lens.noise.median() / _sizes(sight.frames(chosen)).median() * _sizes(seen)
-    lens = Lens(noise, lens.gain)
-    heads = solve(model, neutral, seen, start(model, seen), lens, steps=4)
-    fits = _misfit(model, neutral, seen, heads, lens) < _MISFIT * _sizes(seen) + _BLUR
+    neutral, quality = _learn(model, smooth_modes(model), observed.frames(chosen))
+    seen = observed.frames(rows)
+    noise = quality.noise.median() / _sizes(observed.frames(chosen)).median() * _sizes(seen)
+    quality = ObservationQuality(noise, quality.gain)
+    heads = solve(model, neutral, seen, start(model, seen), quality, steps=4)
+    fits = _misfit(model, neutral, seen, heads, quality) < _MISFIT * _sizes(seen) + _BLUR
     if not fits.any():
         return None
     return _handed_on(model, neutral, heads, rows, fits, views)
 
 
-def _learn(model: FaceModel, modes: Modes, sight: Sight) -> tuple[Tensor, Lens]:
+def _learn(model: FaceModel, modes: Modes, observed: FaceObservations) -> tuple[Tensor, ObservationQuality]:
     """The neutral face, and the quality of the observations that it was learnt from."""
-    neutral, heads = model.mean, start(model, sight)
-    lens = Lens(_FIRST_NOISE * _sizes(sight))
+    neutral, heads = model.mean, start(model, observed)
+    quality = ObservationQuality(_FIRST_NOISE * _sizes(observed))
     for _ in range(_ROUNDS):
-        heads = solve(model, neutral, sight, heads, lens, steps=2)
-        if len(sight.mask) >= _RESTS_WITHIN:
+        heads = solve(model, neutral, observed, heads, quality, steps=2)
+        if len(observed.mask) >= _RESTS_WITHIN:
             neutral, heads = _at_rest(model, neutral, heads)
-        lens = _quality(model, neutral, sight, heads, lens)
-        neutral = solve_neutral(model, modes, neutral, sight, heads, lens)
-    return neutral, lens
+        quality = _quality(model, neutral, observed, heads, quality)
+        neutral = solve_neutral(model, modes, neutral, observed, heads, quality)
+    return neutral, quality
 
 
-def _at_rest(model: FaceModel, neutral: Tensor, heads: Heads) -> tuple[Tensor, Heads]:
+def _at_rest(model: FaceModel, neutral: Tensor, heads: HeadPoses) -> tuple[Tensor, HeadPoses]:
     """The same faces with what psi is at rest moved from psi to the neutral face.
 
     An expression held throughout and a face of that shape look alike; but a face comes back to rest, and
@@ -89,45 +97,57 @@ def densest_half(values: Tensor) -> Tensor:
     return ordered.gather(0, begin + torch.arange(half)[:, None]).mean(0)
 
 
-def _quality(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Lens:
+def _quality(
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+) -> ObservationQuality:
     """Noise as the median says it, in proportion to the face's size, and the gain of depth."""
-    linear = linearise(model, neutral, sight, heads, lens)
-    trusted = sight.mask > 0
-    off = (linear.residual[..., :2] * lens.noise[:, None, None])[trusted].abs() / 0.6745
-    sizes = _sizes(sight)
-    relative = (off / sizes[:, None].expand_as(sight.mask)[trusted][:, None]).median()
+    linear = linearise(model, neutral, observed, heads, quality)
+    trusted = observed.mask > 0
+    off = (linear.residual[..., :2] * quality.noise[:, None, None])[trusted].abs() / 0.6745
+    sizes = _sizes(observed)
+    relative = (off / sizes[:, None].expand_as(observed.mask)[trusted][:, None]).median()
     noise = (relative * sizes).clamp_min(_LEAST_NOISE)
     posed = (linear.posed @ heads.rotation.mT)[..., 2]
-    predicted = posed * (sight.focal[:, :1] / heads.place[:, 2:].clamp_min(0.05))
+    predicted = posed * (observed.focal[:, :1] / heads.place[:, 2:].clamp_min(0.05))
     weight = linear.weight / sizes[:, None].square()
     mean = [
         (v * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1e-9)
-        for v in (predicted, sight.depth)
+        for v in (predicted, observed.depth)
     ]
-    predicted, found = predicted - mean[0], sight.depth - mean[1]
+    predicted, found = predicted - mean[0], observed.depth - mean[1]
     gain = float((weight * predicted * found).sum() / (weight * predicted.square()).sum().clamp_min(1e-9))
-    return Lens(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
+    return ObservationQuality(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
 
 
-def _misfit(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Tensor:
+def _misfit(
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+) -> Tensor:
     """The median distance in pixels between seen and predicted points of each frame: [T]."""
-    linear = linearise(model, neutral, sight, heads, lens)
-    off = (linear.residual[..., :2] * lens.noise[:, None, None]).norm(dim=-1)
-    off = torch.where(sight.mask > 0, off, torch.full_like(off, torch.nan))
+    linear = linearise(model, neutral, observed, heads, quality)
+    off = (linear.residual[..., :2] * quality.noise[:, None, None]).norm(dim=-1)
+    off = torch.where(observed.mask > 0, off, torch.full_like(off, torch.nan))
     return off.nanmedian(dim=1).values
 
 
-def _sizes(sight: Sight) -> Tensor:
+def _sizes(observed: FaceObservations) -> Tensor:
     """The size of each face in pixels, [T]: the spread of its points, depth included."""
-    weight = sight.mask[..., None]
-    places = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
+    weight = observed.mask[..., None]
+    places = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
     total = weight.sum(1).clamp_min(1)
     middle = (places * weight).sum(1) / total
     return ((places - middle[:, None]).square() * weight).sum((1, 2)).div(total[:, 0]).sqrt().clamp_min(1.0)
 
 
 def _handed_on(
-    model: FaceModel, neutral: Tensor, heads: Heads, rows: Tensor, fits: Tensor, views: Views
+    model: FaceModel, neutral: Tensor, heads: HeadPoses, rows: Tensor, fits: Tensor, views: CameraBatch
 ) -> FaceTarget:
     """The fitted rows of the clip, spread over all of its frames."""
     count, fitted = len(views.focal), rows[fits]

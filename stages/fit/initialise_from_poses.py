@@ -16,22 +16,23 @@ from torch import Tensor
 from pipeline.body import BodyModel, Identity, Poses, mean_identity, rest_joints
 from pipeline.errors import UserError
 from pipeline.pose_files import (
-    RECORD,
+    INITIAL_POSES,
     InitialPoses,
+    into_world,
+    is_official_smplx,
+    knows_coefficients,
     on_frames,
     read_hand_mean,
     read_initial_poses,
-    read_record,
+    read_smplx_json,
     with_flat_hands,
 )
-from pipeline.pose_files.axes import into_world
-from pipeline.pose_files.coefficients import is_official_smplx, knows_coefficients
+from stages.fit.camera_batch import CameraBatch
 from stages.fit.face_direction import pose_facing
 from stages.fit.initialise import weak_perspective
 from stages.fit.observations import Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
 from stages.fit.settings import FitSettings
-from stages.fit.views import Views
 
 _CHUNK = 256  # frames posed at a time
 
@@ -47,10 +48,8 @@ def given_poses(
     """The poses to start from: those of ``fit.pose_init``, else those that ingest has published.
 
     Args:
-        settings: the stage's.
         ingest: what ingest has published.
-        body: the body.
-        body_file: its file, for the hands.
+        body_file: the body's file, for the hands.
         frames: the frame numbers, increasing.
         log: told in a line each what a user should know.
 
@@ -62,22 +61,22 @@ def given_poses(
         UserError: they cannot be read, or are to be kept and are not there.
     """
     if settings.pose_init:
-        return read_initial_poses(Path(settings.pose_init), frames, read_hand_mean(body_file), log)
+        return read_smplx_json(Path(settings.pose_init), frames, read_hand_mean(body_file), log)
     if settings.given == "ignore":
         return None
-    path = ingest / RECORD
+    path = ingest / INITIAL_POSES
     if not path.is_file():
         if settings.given == "keep":
             raise UserError(
                 f"{ingest} has no poses to keep: fit.given=keep is for datasets that bring fitted poses"
             )
         return None
-    poses = on_frames(read_record(path), frames)
+    poses = on_frames(read_initial_poses(path), frames)
     log(f"starts from the poses that came with the footage: {int(poses.valid.sum())} of {len(frames)} frames")
     return with_flat_hands(poses, body_file, is_official_smplx(body), log)
 
 
-def keep_given(start: InitialPoses, body: BodyModel, views: Views) -> tuple[Identity, Poses]:
+def keep_given(start: InitialPoses, body: BodyModel, views: CameraBatch) -> tuple[Identity, Poses]:
     """Identity and poses as another program has fitted them (ExAvatar's ``smplx_optimized``).
 
     Their joint offsets add to joints of a template with its face offsets, and their root joint has none
@@ -114,7 +113,6 @@ def given_identity(start: InitialPoses, body: BodyModel, remedy: str) -> Identit
     """The identity of fitted poses: beta, Delta J and Delta V_face; the mean's where they have none.
 
     Args:
-        start: the poses.
         body: the body that the coefficients belong to.
         remedy: ends an error's message.
 
@@ -143,7 +141,7 @@ def _resized(values: Tensor, length: int) -> Tensor:
     return torch.nn.functional.pad(values, (0, length - values.shape[-1]))
 
 
-def initial_facing(start: InitialPoses, body: BodyModel, views: Views) -> np.ndarray:
+def initial_facing(start: InitialPoses, body: BodyModel, views: CameraBatch) -> np.ndarray:
     """The cosine at which the estimated heads look at the camera, see ``face_direction.pose_facing``: [T]."""
     nowhere = torch.zeros(len(start.frames), 3)
     rotation, _ = _in_world(start, nowhere, nowhere[0], views)
@@ -155,7 +153,7 @@ def initial_from_files(
     body: BodyModel,
     observations: Observations,
     model: LandmarkModel,
-    views: Views,
+    views: CameraBatch,
     log: Callable[[str], None] = lambda note: None,
     believe: bool = False,
 ) -> Parameters:
@@ -167,10 +165,6 @@ def initial_from_files(
 
     Args:
         start: poses of the observations' frames.
-        body: the body.
-        observations: what the fit aims at.
-        model: the landmarks.
-        views: the cameras.
         log: told in one line each what of the files was not used.
         believe: take the files' place also where the landmarks know a better one.
 
@@ -224,21 +218,21 @@ def _landmarks(model: LandmarkModel, parameters: Parameters) -> Tensor:
     return torch.cat([model.posed(piece, piece.matrices)[0] for piece in pieces])
 
 
-def _error(points: Tensor, transl: Tensor, observations: Observations, views: Views) -> float:
+def _error(points: Tensor, transl: Tensor, observations: Observations, views: CameraBatch) -> float:
     """The median distance of trusted landmarks from where they were seen, pixels; 0 if none is."""
     pixels = views.to_pixels(views.to_camera(points + transl[:, None]))
     errors = (pixels - observations.pixels).norm(dim=-1)[observations.mask]
     return float(errors.median()) if len(errors) else 0.0
 
 
-def _in_world(start: InitialPoses, transl: Tensor, pivot: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+def _in_world(
+    start: InitialPoses, transl: Tensor, pivot: Tensor, views: CameraBatch
+) -> tuple[Tensor, Tensor]:
     """Rotation vectors [T, 55, 3] and places [T, 3] in the world, of poses in their cameras' axes.
 
     Args:
-        start: the poses.
         transl: [T, 3], metres, their places.
         pivot: [3], metres, the point that the root turns about.
-        views: the cameras.
     """
     orient, placed = into_world(start.rotation[:, 0], transl, pivot, views.rotation, views.translation)
     return torch.cat([orient[:, None].to(start.rotation), start.rotation[:, 1:]], dim=1), placed

@@ -1,4 +1,4 @@
-"""What ``motion=`` may be. Imports nothing heavy: the DAG asks, too."""
+"""The values that ``motion=`` may have. Imports nothing heavy: the DAG asks, too."""
 
 from __future__ import annotations
 
@@ -16,9 +16,16 @@ REMEDY = (
 )
 
 
+SUBJECT_FILES = {
+    "ingest": ("footage.json", "cameras.parquet"),
+    "fit": ("identity.safetensors", "poses.parquet"),
+}
+"""Stage -> files that are read of a subject whose clip is the motion."""
+
+
 @dataclasses.dataclass(frozen=True)
-class MotionName:
-    """What drives the avatar.
+class MotionSource:
+    """The kind and the place of a motion.
 
     Attributes:
         kind: ``turntable``, ``subject``, ``bvh``, ``amass`` or ``peers``.
@@ -31,27 +38,27 @@ class MotionName:
     subject: str = ""
 
 
-def motion_name(text: str) -> MotionName:
-    """Reads ``motion=``; whether a file is there and whole is found out when it is read.
+def motion_source(text: str) -> MotionSource:
+    """The source that ``motion=`` names; a file's content is checked when it is read.
 
     Raises:
         UserError: it is none of the things that a motion may be.
     """
     if text == TURNTABLE:
-        return MotionName(TURNTABLE)
+        return MotionSource(TURNTABLE)
     if text.startswith(SUBJECT) and len(text) > len(SUBJECT):
-        return MotionName("subject", subject=text.removeprefix(SUBJECT))
+        return MotionSource("subject", subject=text.removeprefix(SUBJECT))
     path = Path(text)
     if not text or not path.exists():
         raise UserError(f"motion={text}: there is no such file; {REMEDY}")
     if path.is_dir():
-        return MotionName("peers", path)
+        return MotionSource("peers", path)
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise UserError(f"motion={text}: a {path.suffix or 'file without a suffix'} is no motion; {REMEDY}")
-    return MotionName(kind, path)
+    return MotionSource(kind, path)
 
 
-def borrowed_subject(text: str) -> str:
+def named_subject(text: str) -> str:
     """The subject whose fit a motion is; empty where it is none."""
     return text.removeprefix(SUBJECT) if text.startswith(SUBJECT) else ""

@@ -32,12 +32,10 @@ from torch import Tensor
 
 from pipeline.body import JOINT_NAMES, BodyModel
 from pipeline.errors import UserError
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import USUAL_FPS, Motion, Span
-from pipeline.pose_files.coefficients import is_official_smplx
+from pipeline.pose_files import is_official_smplx
 from pipeline.untrusted import read_npz
+from stages.animate.motions.motion import USUAL_FPS, Motion, Span, leg_length
 
-AXES = ("auto", "y", "z")
 _REMEDY = "name an AMASS or SMPL-X motion with poses (or root_orient and pose_body) and trans"
 _BODY, _FACE, _HANDS = slice(1, 22), slice(22, 25), slice(25, 55)
 _LAYOUTS = {66: (_BODY,), 72: (_BODY,), 156: (_BODY, _HANDS), 165: (_BODY, _FACE, _HANDS)}
@@ -52,7 +50,6 @@ def read_amass(path: Path, body: BodyModel, span: Span, up: str = "auto") -> Mot
     """Reads an archive.
 
     Args:
-        path: the .npz.
         body: whose expressions and shapes the numbers may belong to.
         span: which frames are wanted.
         up: the axis that is up in the file: y, z or auto.
@@ -84,7 +81,7 @@ def read_amass(path: Path, body: BodyModel, span: Span, up: str = "auto") -> Mot
         rotation=rotation.float(),
         expression=_expression(path, arrays, body, count, rows),
         root=root.float(),
-        leg=leg_of(body, betas=_betas(path, arrays) if is_official_smplx(body) else None),
+        leg=leg_length(body, betas=_betas(path, arrays) if is_official_smplx(body) else None),
         told=told,
         notes=tuple(notes),
     )
@@ -175,7 +172,7 @@ def _expression(
 
 
 def _z_is_up(root: Tensor, up: str) -> bool:
-    """Whether Z is the world's up axis; root [T, 3] rotation vectors."""
+    """True if Z is the world's up axis; root [T, 3] rotation vectors."""
     if up != "auto":
         return up == "z"
     upward = roma.rotvec_to_rotmat(root)[:, :, 1].mean(0)  # where the body's own Y axis points

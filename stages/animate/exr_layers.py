@@ -42,7 +42,7 @@ NAMES = ("beauty", "alpha", "depth", "normal", "part")
 
 
 @dataclasses.dataclass(frozen=True)
-class Layers:
+class ExrLayers:
     """One frame's layers, see the module.
 
     Attributes:
@@ -64,13 +64,12 @@ def decode_srgb(encoded: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def layers_of(gaussians: Gaussians, parts: Tensor, camera: Camera, rendering: Rendering) -> Layers:
+def exr_layers(gaussians: Gaussians, parts: Tensor, camera: Camera, rendering: Rendering) -> ExrLayers:
     """The layers of a frame.
 
     Args:
         gaussians: that are shown.
         parts: [N] int64, the part of each.
-        camera: the view.
         rendering: what ``render`` made of the two.
     """
     alpha = rendering.alpha.clamp(0, 1)
@@ -80,7 +79,7 @@ def layers_of(gaussians: Gaussians, parts: Tensor, camera: Camera, rendering: Re
     light = decode_srgb(straight) * alpha[..., None] * seen[..., None]
     normal = render(dataclasses.replace(gaussians, colors=outward(gaussians)), camera).color
     normal = torch.nn.functional.normalize(normal, dim=-1) * seen[..., None]
-    return Layers(
+    return ExrLayers(
         beauty=torch.cat([light, alpha[..., None]], -1),
         depth=torch.where(seen, rendering.depth / safe, torch.full_like(alpha, NOWHERE)),
         normal=normal,
@@ -97,7 +96,7 @@ def outward(gaussians: Gaussians) -> Tensor:
 
 
 def most_seen(gaussians: Gaussians, parts: Tensor, camera: Camera) -> Tensor:
-    """Which part has the largest weight in each pixel: [H, W] int64; only parts that there are are drawn."""
+    """The part with the largest weight in each pixel: [H, W] int64."""
     there = parts.unique().tolist()
     shares = []
     for start in range(0, len(there), 3):
@@ -109,7 +108,7 @@ def most_seen(gaussians: Gaussians, parts: Tensor, camera: Camera) -> Tensor:
     return torch.tensor(there)[torch.cat(shares, -1).argmax(-1)]
 
 
-def write_layers(path: Path, layers: Layers) -> None:
+def write_layers(path: Path, layers: ExrLayers) -> None:
     """Writes one frame. Equal layers give equal bytes.
 
     Raises:

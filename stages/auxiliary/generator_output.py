@@ -1,4 +1,4 @@
-"""What every generator gives: pictures of the person in known poses before known cameras."""
+"""The output of every generator: pictures of the person in known poses before known cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.clip.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
+class GeneratedPicture:
     """One generated frame.
 
     Attributes:
@@ -29,7 +29,7 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True)
-class Offer:
+class GeneratorOutput:
     """A generator's frames.
 
     Attributes:
@@ -42,5 +42,5 @@ class Offer:
 
     poses: Poses
     cameras: Mapping[int, Camera]
-    pictures: Iterator[Picture]
+    pictures: Iterator[GeneratedPicture]
     exact: bool = False

@@ -40,7 +40,7 @@ def read_numbered_clip(ingest: Path, fit: Path, body_file: Path) -> FittedClip:
 
 
 @dataclasses.dataclass(frozen=True)
-class Turn:
+class TurntableMotion:
     """The driving motion. Its frames are numbered from 0.
 
     Attributes:
@@ -54,7 +54,7 @@ class Turn:
     azimuth: np.ndarray
 
 
-def make_turn(clip: FittedClip, settings: AuxiliarySettings) -> Turn:
+def make_turntable_motion(clip: FittedClip, settings: AuxiliarySettings) -> TurntableMotion:
     """A full turn of the fitted person, upright, at a distance at which nothing is cut off."""
     count = settings.frames
     azimuth = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
@@ -68,7 +68,7 @@ def make_turn(clip: FittedClip, settings: AuxiliarySettings) -> Turn:
     poses = Poses(tuple(range(count)), rotation, expression, -pelvis.expand(count, 3).clone())
     camera, place = _placed(clip, poses, settings)
     poses = dataclasses.replace(poses, transl=poses.transl + place)
-    return Turn(poses, camera, azimuth.numpy())
+    return TurntableMotion(poses, camera, azimuth.numpy())
 
 
 def _postures(clip: FittedClip, settings: AuxiliarySettings) -> Tensor:

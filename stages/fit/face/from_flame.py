@@ -61,9 +61,7 @@ def face_from_flame(
     """The clip's face as FLAME and DECA's parameters describe it.
 
     Args:
-        model: the body's face.
         body: the body, for its joints.
-        flame: the user's FLAME.
         parameters: DECA's, of T frames.
 
     Returns:

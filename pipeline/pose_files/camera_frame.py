@@ -1,4 +1,4 @@
-"""What the numbers in pose files are relative to, and what they are in this project.
+"""Conversion between the axes of pose files (each frame's camera) and the world.
 
 The files describe a body in the axes of the frame's own camera, which are OpenCV's: X right, Y down, Z
 ahead. Somebody upright who faces the camera has a ``root_pose`` of pi about X. A point x of the body at

@@ -22,13 +22,13 @@ from stages.fit.face.target import FaceModel
 
 CHUNK = 64  # frames whose Jacobians are held at once
 DEPTH_NOISE = 3.0
-"""How much farther off the estimator's z is than its x and y.
+"""Noise of the estimator's z over that of its x and y.
 
 It is inferred from the face's look rather than seen, and errs by a tenth to a fifth of the face's depth.
 """
 
 TOGETHER = 0.25
-"""What a landmark counts for, since neighbouring ones err together: a quarter of a point."""
+"""Weight of a landmark, since neighbouring ones err together: a quarter of a point."""
 
 _EXPRESSION = 0.3  # standard deviation of a coefficient of psi; 3 is about all that a face can do
 _EXPRESSION_LIMIT = 3.0
@@ -37,7 +37,7 @@ _OUTLIER = 4.0  # squared residual over squared noise from which a point loses i
 
 
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class FaceObservations:
     """A face's F points as they were seen in T frames.
 
     Attributes:
@@ -52,13 +52,13 @@ class Sight:
     mask: Tensor
     focal: Tensor
 
-    def frames(self, rows: Tensor | slice) -> Sight:
+    def frames(self, rows: Tensor | slice) -> FaceObservations:
         """Some of the frames."""
-        return Sight(self.pixels[rows], self.depth[rows], self.mask[rows], self.focal[rows])
+        return FaceObservations(self.pixels[rows], self.depth[rows], self.mask[rows], self.focal[rows])
 
 
 @dataclasses.dataclass(frozen=True)
-class Heads:
+class HeadPoses:
     """The unknowns of T frames.
 
     Attributes:
@@ -77,7 +77,7 @@ class Heads:
 
 
 @dataclasses.dataclass(frozen=True)
-class Lens:
+class ObservationQuality:
     """The quality of the observations.
 
     Attributes:
@@ -90,7 +90,7 @@ class Lens:
 
 
 @dataclasses.dataclass(frozen=True)
-class Linear:
+class Linearisation:
     """The model about the present unknowns.
 
     Attributes:
@@ -108,21 +108,21 @@ class Linear:
     posed: Tensor
 
 
-def start(model: FaceModel, sight: Sight) -> Heads:
+def start(model: FaceModel, observed: FaceObservations) -> HeadPoses:
     """Heads by Procrustes' fit of the points that neither the jaw nor an expression moves."""
-    weights = sight.mask * rigidity(model)
-    seen = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
+    weights = observed.mask * rigidity(model)
+    seen = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
     nothing = weights.sum(1) < 1e-6
     weights = torch.where(nothing[:, None], torch.ones_like(weights), weights)
     mean = model.mean.expand(len(seen), -1, -1)
     rotation, shift, scale = roma.rigid_points_registration(mean, seen, weights, compute_scaling=True)
-    distance = sight.focal.mean(1) / scale.clamp_min(1e-3)
+    distance = observed.focal.mean(1) / scale.clamp_min(1e-3)
     centre = (mean * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
     middle = (seen * weights[..., None]).sum(1) / weights.sum(1, keepdim=True)
-    ahead = torch.cat([middle[:, :2] / sight.focal * distance[:, None], distance[:, None]], dim=1)
+    ahead = torch.cat([middle[:, :2] / observed.focal * distance[:, None], distance[:, None]], dim=1)
     place = ahead - (rotation @ centre[..., None])[..., 0]
     zeros = seen.new_zeros(len(seen), model.expression.shape[2])
-    return Heads(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
+    return HeadPoses(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
 
 
 def rigidity(model: FaceModel) -> Tensor:
@@ -131,29 +131,40 @@ def rigidity(model: FaceModel) -> Tensor:
     return (1 - model.jaw_weight).clamp_min(0) ** 4 / (1 + moves.square())
 
 
-def solve(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens, steps: int) -> Heads:
+def solve(
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+    steps: int,
+) -> HeadPoses:
     """Gauss-Newton steps on every frame.
 
     Args:
-        model: the face.
         neutral: n, [F, 3], metres.
-        sight: what was seen in T frames.
-        heads: where to begin.
-        lens: the observations' quality.
+        observed: what was seen in T frames.
+        quality: of the observations.
         steps: how many.
     """
     done = []
-    for begin in range(0, len(sight.mask), CHUNK):
+    for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
-        part = Heads(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(Heads)))
-        seen, quality = sight.frames(rows), Lens(lens.noise[rows], lens.gain)
+        part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
+        seen, known = observed.frames(rows), ObservationQuality(quality.noise[rows], quality.gain)
         for _ in range(steps):
-            part = _step(model, linearise(model, neutral, seen, part, quality), part, seen, quality)
+            part = _step(model, linearise(model, neutral, seen, part, known), part, known)
         done.append(part)
-    return Heads(*(torch.cat([getattr(p, f.name) for p in done]) for f in dataclasses.fields(Heads)))
+    return HeadPoses(*(torch.cat([getattr(p, f.name) for p in done]) for f in dataclasses.fields(HeadPoses)))
 
 
-def linearise(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens) -> Linear:
+def linearise(
+    model: FaceModel,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
+) -> Linearisation:
     """Residuals and derivatives; arguments as in ``solve``."""
     turn = roma.rotvec_to_rotmat(_about_x(heads.jaw))  # [T, 3, 3]
     eye = torch.eye(3, dtype=turn.dtype)
@@ -162,24 +173,26 @@ def linearise(model: FaceModel, neutral: Tensor, sight: Sight, heads: Heads, len
     posed = (blend @ (shaped - model.jaw_joint)[..., None])[..., 0] + model.jaw_joint
     seen = posed @ heads.rotation.mT + heads.place[:, None]
     near = seen[..., 2:].clamp_min(0.05)
-    focal, distance = sight.focal[:, None], heads.place[:, None, 2:].clamp_min(0.05)
+    focal, distance = observed.focal[:, None], heads.place[:, None, 2:].clamp_min(0.05)
     pixels = seen[..., :2] / near * focal
-    per_metre = lens.gain * focal[..., :1] / distance
+    per_metre = quality.gain * focal[..., :1] / distance
     depth = per_metre * (seen[..., 2:] - heads.place[:, None, 2:]) + heads.origin[:, None, None]
-    found = torch.cat([sight.pixels, sight.depth[..., None]], dim=-1)
-    sigma = torch.stack([lens.noise, lens.noise, DEPTH_NOISE * lens.noise], dim=1)[:, None]
+    found = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
+    sigma = torch.stack([quality.noise, quality.noise, DEPTH_NOISE * quality.noise], dim=1)[:, None]
     residual = (found - torch.cat([pixels, depth], dim=-1)) / sigma
-    weight = sight.mask / (1 + residual.square().mean(-1) / _OUTLIER).square()
+    weight = observed.mask / (1 + residual.square().mean(-1) / _OUTLIER).square()
     camera = seen.new_zeros(*seen.shape, 3)
     camera[..., 0, 0], camera[..., 1, 1] = (focal / near).unbind(-1)
     camera[..., :2, 2] = -pixels / near
     camera[..., 2, 2] = per_metre[..., 0]
-    return Linear(residual, weight, camera / sigma[..., None], heads.rotation[:, None] @ blend, posed)
+    return Linearisation(residual, weight, camera / sigma[..., None], heads.rotation[:, None] @ blend, posed)
 
 
-def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Lens) -> Heads:
+def _step(
+    model: FaceModel, linear: Linearisation, heads: HeadPoses, quality: ObservationQuality
+) -> HeadPoses:
     """One damped Gauss-Newton step; priors on the jaw and psi are part of the normal equations."""
-    jacobian = _jacobian(model, linear, heads, lens)  # [T, F, 3, P]
+    jacobian = _jacobian(model, linear, heads, quality)  # [T, F, 3, P]
     weighted = jacobian * (TOGETHER * linear.weight)[..., None, None]
     flat = weighted.flatten(1, 2).mT  # [T, P, 3F]
     normal = (flat @ jacobian.flatten(1, 2)).double()
@@ -193,7 +206,7 @@ def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Le
     normal = normal + torch.diag_embed(precision + damping)
     step = torch.linalg.solve(normal, right[..., None])[..., 0].float()
     turn = roma.rotvec_to_rotmat(step[:, :3].clamp(-0.5, 0.5))
-    return Heads(
+    return HeadPoses(
         rotation=roma.special_procrustes(heads.rotation @ turn),
         place=heads.place + step[:, 3:6],
         origin=heads.origin + step[:, 6],
@@ -202,7 +215,9 @@ def _step(model: FaceModel, linear: Linear, heads: Heads, sight: Sight, lens: Le
     )
 
 
-def _jacobian(model: FaceModel, linear: Linear, heads: Heads, lens: Lens) -> Tensor:
+def _jacobian(
+    model: FaceModel, linear: Linearisation, heads: HeadPoses, quality: ObservationQuality
+) -> Tensor:
     """Derivatives by rotation, place, depth origin, jaw and psi: [T, F, 3, 8 + E]."""
     in_camera = linear.camera @ heads.rotation[:, None]  # by a shift in the head's axes
     axes = torch.eye(3, dtype=in_camera.dtype).expand(*linear.posed.shape, 3)
@@ -211,7 +226,7 @@ def _jacobian(model: FaceModel, linear: Linear, heads: Heads, lens: Lens) -> Ten
     place = linear.camera.clone()
     place[..., 2, :] = 0
     origin = torch.zeros_like(linear.residual)
-    origin[..., 2] = (1 / (DEPTH_NOISE * lens.noise))[:, None]
+    origin[..., 2] = (1 / (DEPTH_NOISE * quality.noise))[:, None]
     swing = torch.linalg.cross(axes[..., 0, :], linear.posed - model.jaw_joint)
     jaw = in_camera @ (model.jaw_weight[:, None] * swing)[..., None]
     # A product a point over all frames: one a point and frame is many times slower.

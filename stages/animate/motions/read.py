@@ -1,4 +1,4 @@
-"""The way in: whatever ``motion=`` names, as a ``Motion``."""
+"""Reading a motion of any kind that ``motion=`` names."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ import torch
 
 from pipeline.body import JOINT_NAMES, BodyModel, Identity, rest_joints
 from pipeline.clip.frames import spread_end_to_end
-from pipeline.motion.amass import read_amass
 from pipeline.motion.bvh import read_bvh
-from pipeline.motion.fitted_motion import read_fitted
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import Motion, Span
-from pipeline.motion.motion_name import MotionName
 from pipeline.motion.retarget import match_joints, retarget_rows
-from pipeline.motion.smplx_json import read_peers
+from stages.animate.motions.amass import read_amass
+from stages.animate.motions.fitted_motion import read_fitted
+from stages.animate.motions.motion import Motion, Span, leg_length
+from stages.animate.motions.pose_folder import read_pose_folder
+from stages.animate.motions.source import MotionSource
 
 _REFERENCE_FRAMES = 500  # among which the one with the straightest limbs is sought
 
 
 @dataclasses.dataclass(frozen=True)
-class Wearer:
-    """Who is to be moved.
+class DrivenPerson:
+    """The person that a motion is given to.
 
     Attributes:
         body: the body model.
@@ -38,12 +37,14 @@ class Wearer:
     identity: Identity
 
 
-def read_motion(name: MotionName, wearer: Wearer, span: Span, up: str, folders: Mapping[str, Path]) -> Motion:
+def read_motion(
+    name: MotionSource, person: DrivenPerson, span: Span, up: str, folders: Mapping[str, Path]
+) -> Motion:
     """Reads a motion; not a turntable, which is none.
 
     Args:
         name: what it is.
-        wearer: who is to be moved by it.
+        person: who is to be moved by it.
         span: which frames are wanted.
         up: the axis that is up in an .npz: y, z or auto.
         folders: the other subject's results, if it is one.
@@ -52,16 +53,16 @@ def read_motion(name: MotionName, wearer: Wearer, span: Span, up: str, folders: 
         UserError: it cannot be read; names the file and the remedy.
     """
     if name.kind == "subject":
-        return read_fitted(name.subject, folders, wearer.body, span)
+        return read_fitted(name.subject, folders, person.body, span)
     assert name.path is not None
     if name.kind == "bvh":
-        return read_capture(name.path, wearer, span)
+        return read_capture(name.path, person, span)
     if name.kind == "amass":
-        return read_amass(name.path, wearer.body, span, up)
-    return read_peers(name.path, wearer.body, wearer.body_file, span)
+        return read_amass(name.path, person.body, span, up)
+    return read_pose_folder(name.path, person.body, person.body_file, span)
 
 
-def read_capture(path: Path, wearer: Wearer, span: Span) -> Motion:
+def read_capture(path: Path, person: DrivenPerson, span: Span) -> Motion:
     """Reads a BVH file and carries it over, see ``retarget``.
 
     Raises:
@@ -72,8 +73,8 @@ def read_capture(path: Path, wearer: Wearer, span: Span) -> Motion:
     rows, fps = span.rows(len(bvh.values), bvh.fps, path.name)
     count = len(bvh.values)
     reference = np.array(spread_end_to_end(range(count), _REFERENCE_FRAMES), np.int64)
-    joints = rest_joints(wearer.body, wearer.identity)
-    rotation, root = retarget_rows(bvh, joints, wearer.body.parents, rows, reference)
+    joints = rest_joints(person.body, person.identity)
+    rotation, root = retarget_rows(bvh, joints, person.body.parents, rows, reference)
     used = set(columns.values())
     return Motion(
         name=path.name,
@@ -82,7 +83,7 @@ def read_capture(path: Path, wearer: Wearer, span: Span) -> Motion:
         rotation=rotation,
         expression=None,
         root=root,
-        leg=leg_of(wearer.body, identity=wearer.identity),
+        leg=leg_length(person.body, identity=person.identity),
         told=tuple(joint for joint in JOINT_NAMES if joint in columns),
         unused=tuple(joint for place, joint in enumerate(bvh.names) if place not in used),
     )
