@@ -44,8 +44,9 @@ class Run:
     def __init__(self, name: str, model: Avatar | StraightforwardAvatar, dtype: torch.dtype):
         """Starts at step 0."""
         self.name, self.model, self.dtype = name, model, dtype
-        planes = list(model.triplane.parameters())
-        rest = [one for key, one in model.named_parameters() if not key.startswith("triplane.")]
+        networks = model.representation if isinstance(model, Avatar) else model
+        planes = list(networks.triplane.parameters())
+        rest = [one for key, one in networks.named_parameters() if not key.startswith("triplane.")]
         groups = [{"params": part, "lr": rate} for part, rate in zip((planes, rest), RATES, strict=True)]
         self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
         self.losses: list[float] = []
@@ -142,7 +143,7 @@ def contestants(truth: Avatar) -> list[Run]:
 
     rounded = fresh(False)
     with torch.no_grad():
-        planes = rounded.triplane.planes
+        planes = rounded.representation.triplane.planes
         planes.copy_(torch.nextafter(planes, torch.full_like(planes, torch.inf)))
     double = StraightforwardAvatar(fresh(False)).double()
     for name in ("surface", "base_color"):

@@ -125,7 +125,7 @@ def gradient_picture(
         total = torch.zeros(len(only))
         for _ in range(STEPS):
             trainer.step()
-            total += trainer.avatar.triplane.planes.grad.square().sum(-1).sqrt().flatten()
+            total += trainer.avatar.representation.triplane.planes.grad.square().sum(-1).sqrt().flatten()
         masses[name] = float(total[only].sum() / total.sum())
         resolution = settings.plane_resolution
         pictures[name] = total.view(-1, 3, resolution, resolution)[0, 0].flip(0).numpy()
