@@ -238,7 +238,7 @@ def test_weight_that_is_not_finite_is_never_published(subject, tmp_path, monkeyp
         return values
 
     monkeypatch.setattr(Trainer, "step", step)
-    with pytest.raises(UserError, match="avatar.representation.color.last.bias is not finite after iteration 3"):
+    with pytest.raises(UserError, match="color.last.bias is not finite after iteration 3"):
         stage.run(context)
     assert not list(context.output.iterdir())
 
