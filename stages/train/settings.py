@@ -67,7 +67,7 @@ class TrainSettings:
     representation: Literal["triplane", "bases"] = setting(
         "triplane", "the paper's triplane and heads, or each Gaussian's own parameters and bases"
     )
-    # 8 is best of 0, 8 and 16 on a head clip: more learn the clip by heart (docs/results.md).
+    # A prototype on smile: 35.8, 36.5 and 35.9 dB with 0, 8 and 16; more learn the clip by heart.
     bases: BasesCount = setting(
         8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
     )
