@@ -1,41 +1,39 @@
-"""What auxiliary views are worth: ``python -m benchmarks.auxiliary [--quick] [--json FILE] [--sheet FILE]``.
+"""The worth of auxiliary views, on mannequins.
 
-A mannequin with a textured back is filmed from the front. Its avatar is trained without auxiliary views,
-with the ``texture`` generator's at weights 0.1 and 1, and with the truth's own pictures of all sides at 0.1
-and 1 (the ceiling), and compared with the truth on the seen side (the pipeline's camera) and on the side that
-no camera saw (135, 180 and 225 degrees), in held-out frames. The fit is the pipeline's own and the same for
-all. PSNR, SSIM and LPIPS are of the person on black in the box around it.
+Holds: docs/results.md, "Auxiliary views", and what issue 18 wants better. A mannequin with a textured back is
+filmed from the front. Its avatar is trained without auxiliary views, with the ``texture`` generator's at
+weights 0.1 and 1, and with the truth's own pictures of all sides at 0.1 and 1 (the ceiling). It is compared
+with the truth on the seen side (the pipeline's camera) and on the side that no camera saw (135, 180 and 225
+degrees), in held-out frames. The fit is the pipeline's own and the same for all. PSNR, SSIM and LPIPS are of
+the person on black in the box around it.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
-import json
 import math
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import roma
 import torch
 
-from benchmarks import machine
+from benchmarks import frame
 from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import Poses, load_body, load_landmarks, read_poses, write_poses
+from pipeline.body import BodyModel, Poses, load_body, load_landmarks, read_poses, write_poses
 from pipeline.clip.boxes import Box, person_box
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite_frame
 from pipeline.clip.frames import write_frame, write_mask, write_png
 from pipeline.clip.records import read_split, write_cameras
 from pipeline.config.request import parse_request
-from pipeline.errors import UserError
 from pipeline.metrics import Lpips, psnr, ssim
-from pipeline.run.job import Job, open_job, run_stage
+from pipeline.run.job import Job, open_job
 from pipeline.splat import render
 from pipeline.store.artifact import Artifact
 from stages.ingest.mannequin.footage import Filming
@@ -66,84 +64,63 @@ class Row:
     lpips: float
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the stages, compare, print; returns the exit status."""
-    options = _options(arguments)
-    machine.prepare("benchmarks.auxiliary", 1)
-    rows, sheet = [], []
-    with contextlib.ExitStack() as stack:
-        folder = options.artifacts or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Runs the stages and compares."""
+    defaults = {
+        "ingest__mannequin_views": "", "ingest__mannequin_frames": "16" if options.quick else "40",
+        "ingest__test_frames": "4", "train__iterations": "100" if options.quick else "500",
+        "auxiliary__frames": "24", "auxiliary__texture_guidance": "false", "train__held_out_frames": "0",
+    }  # fmt: skip
+    sheet: list[np.ndarray] = []
+    with frame.settings_of(options, **defaults) as words:
         for framing in options.framings.split(","):
-            try:
-                for row, pictures in _compared(framing, folder, options):
-                    rows.append(row)
-                    sheet.extend(pictures)
-            except UserError as error:
-                print(f"auxiliary: {error}", file=sys.stderr)
-                return 1
-    _print(rows)
-    if options.json is not None:
-        options.json.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")
+            own = {"ingest.mannequin_motion": MOTION[framing], **words}
+            for row, pictures in _compared(framing, own, options.contestants.split(",")):
+                report.add(row)
+                sheet.extend(pictures)
     if options.sheet is not None and sheet:
         write_png(options.sheet, np.concatenate(sheet))
-    print(_headline(rows))
-    return 0
+    return headline(report.tables["rows"])
 
 
-def _options(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.auxiliary", description="Auxiliary views on mannequins."
-    )
-    parser.add_argument("--quick", action="store_true", help="16 frames, 100 iterations")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
     parser.add_argument("--framings", default="full", help="full, upper, head, joined by commas")
     parser.add_argument("--contestants", default=",".join(CONTESTANTS), help="names joined by commas")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every row there")
     parser.add_argument("--sheet", type=Path, metavar="FILE", help="write pictures there")
-    parser.add_argument("--artifacts", type=Path, metavar="DIR", help="keep the stages' results there")
-    parser.add_argument(
-        "words", nargs="*", metavar="NAME=VALUE", help="settings, such as train.iterations=200"
-    )
-    return parser.parse_args(arguments)
+    frame.stage_options(parser)
 
 
 def _compared(
-    framing: str, folder: Path, options: argparse.Namespace
+    framing: str, words: dict[str, str], contestants: list[str]
 ) -> Iterator[tuple[Row, list[np.ndarray]]]:
     """Every contestant's rows on one mannequin, and a strip of pictures each."""
-    words = {
-        "artifacts": str(folder), "ingest.mannequin_motion": MOTION[framing], "ingest.mannequin_views": "",
-        "ingest.mannequin_frames": "16" if options.quick else "40", "ingest.test_frames": "4",
-        "train.iterations": "100" if options.quick else "500", "auxiliary.frames": "24",
-        "auxiliary.texture_guidance": "false", "train.held_out_frames": "0",
-    }  # fmt: skip
-    words |= dict(word.split("=", 1) for word in options.words)
     base = open_job(f"mannequin_{framing}", parse_request(words, f"mannequin_{framing}"))
-    ingest, fit = _made(base, "ingest"), _made(base, "fit")
+    first = frame.made(base, "fit")
+    ingest, fit = first["ingest"], first["fit"]
     scene = _scene(base)
-    truth = folder / f"truth_{framing}"
+    truth = Path(words["artifacts"]) / f"truth_{framing}"
     if not truth.is_dir():
         _write_truth(truth, scene, ingest, fit, 24)
-    network = Lpips(base.workspace.assets / "lpips", "alex")
-    for name in options.contestants.split(","):
+    network = Lpips(frame.asset_folder(base.workspace, "lpips"), "alex")
+    for name in contestants:
         own = CONTESTANTS[name]
         if own["auxiliary.generator"] == "folder":
             own = {**own, "auxiliary.folder": str(truth), "auxiliary.check": "false"}
         job = open_job(base.subject.name, parse_request({**words, **own}, base.subject.name))
-        for stage in ("plan", "auxiliary"):
-            if stage in job.stages:
-                _made(job, stage)
-        avatar = load_avatar(_made(job, "train").folder / "avatar.safetensors", _body(job)).eval()
+        avatar = trained_avatar(job)
         strip: list[np.ndarray] = []
         rows = [_scored(avatar, scene, ingest, fit, side, network, strip) for side in ("seen", "unseen")]
         for place, (side, scores) in enumerate(zip(("seen", "unseen"), rows, strict=True)):
             yield Row(framing, name, side, *scores), [np.concatenate(strip, axis=1)] if place else []
 
 
-def _made(job: Job, stage: str) -> Artifact:
-    return job.find(stage) or run_stage(job, stage)
+def trained_avatar(job: Job) -> Avatar:
+    """The avatar of a job, trained if the store lacks it."""
+    return load_avatar(frame.made(job, "train")["train"].folder / "avatar.safetensors", _body(job)).eval()
 
 
-def _body(job: Job):
+def _body(job: Job) -> BodyModel:
     return load_body(job.workspace.body_file)
 
 
@@ -164,8 +141,8 @@ def around(scene: Scene, degrees: float) -> Camera:
     return dataclasses.replace(shot.camera, rotation=rotation, translation=-rotation @ place)
 
 
-def _filmed(scene: Scene, frame: int, camera: Camera) -> FilmedFrame:
-    return film(scene, frame, camera, make_background(camera, scene.seed))
+def _filmed(scene: Scene, number: int, camera: Camera) -> FilmedFrame:
+    return film(scene, number, camera, make_background(camera, scene.seed))
 
 
 def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, count: int) -> None:
@@ -175,12 +152,12 @@ def _write_truth(folder: Path, scene: Scene, ingest: Artifact, fit: Artifact, co
         (folder / kind).mkdir(parents=True)
     cameras, filmed = {}, []
     for number in range(count):
-        frame, camera = train[number * len(train) // count], around(scene, 360 * number / count)
-        picture = _filmed(scene, frame, camera)
+        moment, camera = train[number * len(train) // count], around(scene, 360 * number / count)
+        picture = _filmed(scene, moment, camera)
         write_frame(folder / "frames", number, picture.image)
         write_mask(folder / "masks", number, picture.mask)
         cameras[number] = camera
-        filmed.append(poses.pose(frame))
+        filmed.append(poses.pose(moment))
     write_poses(folder / "poses.parquet", Poses.stack(range(count), filmed))
     write_cameras(folder / "cameras.parquet", cameras)
 
@@ -198,11 +175,11 @@ def _scored(
     """Mean PSNR, SSIM and LPIPS over the held-out frames; pictures of the first are added to ``strip``."""
     poses = read_poses(fit.folder / "poses.parquet")
     scores = []
-    for frame in read_split(ingest.folder / "split.json").test:
-        gaussians = avatar.gaussians(poses.pose(frame))
+    for number in read_split(ingest.folder / "split.json").test:
+        gaussians = avatar.gaussians(poses.pose(number))
         for degrees in UNSEEN if side == "unseen" else (0.0,):
             camera = around(scene, degrees)
-            picture = _filmed(scene, frame, camera)
+            picture = _filmed(scene, number, camera)
             target = composite_frame(picture.image, picture.mask)
             image = render(gaussians, camera).color.clamp(0, 1)
             part = box_of(picture.mask).slices
@@ -221,21 +198,11 @@ def box_of(mask: np.ndarray) -> Box:
     return person_box([mask], MARGIN) or Box.whole(mask)
 
 
-def _print(rows: list[Row]) -> None:
-    print(machine.described())
-    print(f"{'framing':8} {'contestant':12} {'side':7} {'PSNR':>6} {'SSIM':>7} {'LPIPS':>7}")
-    for row in rows:
-        print(
-            f"{row.framing:8} {row.contestant:12} {row.side:7} "
-            f"{row.psnr:6.2f} {row.ssim:7.4f} {row.lpips:7.4f}"
-        )
-
-
-def _headline(rows: list[Row]) -> str:
-    """The texture's gain over none on either side, framing by framing."""
-    found = {(row.framing, row.contestant, row.side): row.psnr for row in rows}
+def headline(rows: list[dict[str, Any]]) -> str:
+    """The gain of texture and truth over none on either side, framing by framing."""
+    found = {(row["framing"], row["contestant"], row["side"]): row["psnr"] for row in rows}
     parts = []
-    for framing in dict.fromkeys(row.framing for row in rows):
+    for framing in dict.fromkeys(row["framing"] for row in rows):
         for name in ("texture 0.1", "truth 0.1"):
             gains = [
                 f"{side} {found[framing, name, side] - found[framing, 'none', side]:+.2f} dB"
@@ -243,7 +210,12 @@ def _headline(rows: list[Row]) -> str:
                 if (framing, name, side) in found and (framing, "none", side) in found
             ]
             parts += [f"{framing} {name}: {', '.join(gains)}"] if gains else []
-    return "auxiliary views over none: " + "; ".join(parts)
+    return "over none: " + "; ".join(parts)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("auxiliary", __doc__, measure, arguments, threads=1, options=add_options)
 
 
 if __name__ == "__main__":

@@ -1,35 +1,33 @@
-"""The back of a real person: ``python -m benchmarks.auxiliary_balance [--quick] [--json FILE]``.
+"""The worth of auxiliary views on the back of a real person.
 
-``balance`` was filmed by four calibrated cameras. The body is fitted and the avatar trained on camera 1
-(front) alone, with and without auxiliary views, and rendered into cameras 3 and 4 (back), whose own masks
-cut the person out. Front and back are scored in the box around the person, on black. What a fit from one
-camera gets wrong in depth shifts the back views by tens of pixels, so the pictures are also compared after
-the best shift.
+Holds: docs/results.md, "Auxiliary views", and issue 18's goal for balance's back cameras. ``balance`` was
+filmed by four calibrated cameras. The body is fitted and the avatar trained on camera 1 (front) alone, with
+and without auxiliary views, and rendered into cameras 3 and 4 (back), whose own masks cut the person out.
+Front and back are scored in the box around the person, on black. What a fit from one camera gets wrong in
+depth shifts the back views by tens of pixels, so the pictures are also compared after the best shift.
+``--quick``: every tenth frame, 100 iterations.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
-import json
 import sys
-import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from benchmarks import machine
-from benchmarks.auxiliary import _made, box_of
-from benchmarks.held_out_views import _job
-from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import load_body, read_poses
+from benchmarks import frame
+from benchmarks.auxiliary import box_of, trained_avatar
+from benchmarks.held_out_views import job_of
+from pipeline.avatar import Avatar
+from pipeline.body import read_poses
 from pipeline.clip.composite import composite_frame
 from pipeline.clip.frames import read_frame, read_mask, spread_from_start, write_png
 from pipeline.clip.records import read_cameras
-from pipeline.errors import UserError
 from pipeline.metrics import psnr
 from pipeline.splat import render
 from pipeline.store.artifact import Artifact
@@ -50,60 +48,31 @@ class Row:
     shifted: float
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the stages, compare, print; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.auxiliary_balance", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="every tenth frame, 100 iterations")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every row there")
-    parser.add_argument("--sheet", type=Path, metavar="FILE", help="write pictures there; never commit them")
-    parser.add_argument("--artifacts", type=Path, metavar="DIR", help="keep the stages' results there")
-    parser.add_argument("words", nargs="*", metavar="NAME=VALUE", help="settings")
-    options = parser.parse_intermixed_args(arguments)
-    machine.prepare("benchmarks.auxiliary_balance", 1)
-    with contextlib.ExitStack() as stack:
-        folder = options.artifacts or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        words = {
-            "artifacts": str(folder),
-            "auxiliary.texture_guidance": "false",
-            "train.held_out_frames": "0",
-        }
-        if options.quick:
-            words |= {"ingest.stride": "10", "fit.iterations": "100", "train.iterations": "100"}
-        words |= dict(word.split("=", 1) for word in options.words)
-        try:
-            rows, sheet = _compared(words)
-        except UserError as error:
-            print(f"auxiliary_balance: {error}", file=sys.stderr)
-            return 1
-    print(machine.described())
-    print(f"{'contestant':10} {'camera':>6} {'PSNR':>6} {'shifted':>8}")
-    for row in rows:
-        print(f"{row.contestant:10} {row.camera:6} {row.psnr:6.2f} {row.shifted:8.2f}")
-    if options.json is not None:
-        options.json.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Runs the stages and compares."""
+    defaults = {"auxiliary__texture_guidance": "false", "train__held_out_frames": "0"}
+    if options.quick:
+        defaults |= {"ingest__stride": "10", "fit__iterations": "100", "train__iterations": "100"}
+    lines, top = [], []
+    with frame.settings_of(options, **defaults) as words:
+        seen = {number: frame.made(job_of(words, number), "ingest")["ingest"] for number in CAMERAS}
+        for name, generator in CONTESTANTS.items():
+            job = job_of({**words, "auxiliary.generator": generator}, 1)
+            avatar, fit = trained_avatar(job), frame.made(job, "fit")["fit"]
+            line: list[np.ndarray] = []
+            top = []
+            for number in CAMERAS:
+                report.add(Row(name, number, *_scored(avatar, seen[number], fit, line, top)))
+            lines.append(np.concatenate(line, axis=1))
     if options.sheet is not None:
-        write_png(options.sheet, sheet)
-    print(_headline(rows))
-    return 0
+        write_png(options.sheet, np.concatenate([np.concatenate(top, axis=1), *lines]))
+    return headline(report.tables["rows"])
 
 
-def _compared(words: dict[str, str]) -> tuple[list[Row], np.ndarray]:
-    """All rows, and a picture: truth, then a line a contestant."""
-    seen = {number: _made(_job(words, number), "ingest") for number in CAMERAS}
-    rows, lines, top = [], [], []
-    for name, generator in CONTESTANTS.items():
-        job = _job({**words, "auxiliary.generator": generator}, 1)
-        made = {
-            stage: _made(job, stage) for stage in ("fit", "plan", "auxiliary", "train") if stage in job.stages
-        }
-        avatar = load_avatar(made["train"].folder / "avatar.safetensors", load_body(job.workspace.body_file))
-        line: list[np.ndarray] = []
-        top = []
-        for number in CAMERAS:
-            scores = _scored(avatar.eval(), seen[number], made["fit"], line, top)
-            rows.append(Row(name, number, *scores))
-        lines.append(np.concatenate(line, axis=1))
-    return rows, np.concatenate([np.concatenate(top, axis=1), *lines])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
+    parser.add_argument("--sheet", type=Path, metavar="FILE", help="write pictures there; never commit them")
+    frame.stage_options(parser)
 
 
 @torch.no_grad()
@@ -114,11 +83,11 @@ def _scored(
     poses, cameras = read_poses(fit.folder / "poses.parquet"), read_cameras(seen.folder / "cameras.parquet")
     common = sorted(set(poses.frames) & set(cameras))
     plain, shifted = [], []
-    for place, frame in enumerate(spread_from_start(common, FRAMES)):
-        image, mask = read_frame(seen.folder / "frames", frame), read_mask(seen.folder / "masks", frame)
+    for place, number in enumerate(spread_from_start(common, FRAMES)):
+        image, mask = read_frame(seen.folder / "frames", number), read_mask(seen.folder / "masks", number)
         target = composite_frame(image, mask)
-        gaussians = avatar.gaussians(poses.pose(frame))
-        made = render(gaussians, cameras[frame]).color.clamp(0, 1)
+        gaussians = avatar.gaussians(poses.pose(number))
+        made = render(gaussians, cameras[number]).color.clamp(0, 1)
         part = box_of(mask).slices
         plain.append(psnr(made[part], target[part]))
         shifted.append(psnr(_moved(made, target)[part], target[part]))
@@ -141,15 +110,20 @@ def _small(image: torch.Tensor) -> np.ndarray:
     return cv2.resize(picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def _headline(rows: list[Row]) -> str:
-    """The gain in the back cameras and what it cost in front."""
-    found = {(row.contestant, row.camera): row for row in rows}
-    gains = [
-        f"camera {number} {found['texture', number].psnr - found['none', number].psnr:+.2f} dB"
-        f" (shifted {found['texture', number].shifted - found['none', number].shifted:+.2f})"
-        for number in CAMERAS
-    ]
-    return "auxiliary views on balance, texture over none: " + ", ".join(gains)
+def headline(rows: list[dict[str, Any]]) -> str:
+    """The gain in the back cameras and its cost in front."""
+    found = {(row["contestant"], row["camera"]): row for row in rows}
+
+    def gain(number: int, column: str) -> float:
+        return found["texture", number][column] - found["none", number][column]
+
+    gains = [f"camera {n} {gain(n, 'psnr'):+.2f} dB (shifted {gain(n, 'shifted'):+.2f})" for n in CAMERAS]
+    return "texture over none: " + ", ".join(gains)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("auxiliary_balance", __doc__, measure, arguments, threads=1, options=add_options)
 
 
 if __name__ == "__main__":

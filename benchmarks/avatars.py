@@ -1,12 +1,15 @@
-"""What the avatar's benchmarks are run on: an avatar of a given size on the open body, poses and frames."""
+"""Avatars of a given size on the open body, their poses and camera, and the options that choose them."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.frame import CLOCKS
 from pipeline.avatar import Architecture, Avatar
 from pipeline.body import BodyModel, Pose, load_body, mean_identity, subdivide
 from pipeline.clip.camera import Camera, facing_camera
@@ -14,6 +17,34 @@ from pipeline.config.workspace import REPOSITORY
 
 TRANSL = (0.0, 0.41, -3.0)  # metres: the middle of the open body, three metres before the camera
 LARGEST_LEVEL = 2
+COUNTS, SIZES = (10_000, 40_000, 167_000), (256, 512)
+QUICK_COUNTS, QUICK_SIZES = (10_000,), (256,)
+HEADLINE = (40_000, 512)
+
+
+def add_sizes(parser: argparse.ArgumentParser) -> None:
+    """The options that choose the cases of a benchmark of avatars."""
+    parser.add_argument("--repeats", type=int, help="of each contestant in each case")
+    parser.add_argument("--gaussians", type=int, nargs="+", metavar="N", help="the counts to time")
+    parser.add_argument("--sizes", type=int, nargs="+", metavar="PIXELS", help="the pictures to time")
+    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: on a machine that is busy")
+
+
+def sizes_of(options: argparse.Namespace, repeats: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+    """Counts of Gaussians, sizes of pictures and repeats."""
+    counts, sizes = (QUICK_COUNTS, QUICK_SIZES) if options.quick else (COUNTS, SIZES)
+    few = 2 if options.quick else repeats
+    return options.gaussians or counts, options.sizes or sizes, options.repeats or few
+
+
+def chosen_case(rows: list[dict[str, Any]]) -> tuple[int, int, list[dict[str, Any]]]:
+    """Count, size and rows of the middle count at the larger size, or of the last case that was timed."""
+    cases: dict[tuple[int, int], list[dict[str, Any]]] = {}
+    for row in rows:
+        cases.setdefault((row["gaussians"], row["size"]), []).append(row)
+    wanted = [case for case in cases if abs(case[0] / HEADLINE[0] - 1) < 0.01 and case[1] == HEADLINE[1]]
+    case = wanted[0] if wanted else list(cases)[-1]
+    return *case, cases[case]
 
 
 def open_body() -> BodyModel:
@@ -79,7 +110,7 @@ def _kept(body: BodyModel, count: int) -> tuple[int, Tensor]:
 
 
 def _subdivided(body: BodyModel, kept: Tensor, level: int) -> int:
-    """How many vertices the kept part of the body has after subdivision."""
+    """Number of vertices of the kept part of the body after subdivision."""
     new_index = torch.full((len(body.v_template),), -1)
     new_index[kept] = torch.arange(len(kept))
     faces = new_index[body.faces]

@@ -1,17 +1,16 @@
-"""What Ray costs against doit's ``-n``: ``python -m benchmarks.cluster [--quick] [--json FILE]``.
+"""The cost of Ray against doit's ``-n``.
 
-Six small subjects with three stages each, the last of which only waits, so that what is measured is not the
-work but what starts it: doit with ``-n 2``, a batch on a local Ray that it starts by itself, and a batch on a
-Ray cluster of two one-CPU nodes that already runs. All of them begin every stage as a process of its own and
-have two subjects at a time. Then the same again with everything done: what looking at the store costs.
+Holds: docs/results.md, "Datasets". Needs the extra ``cluster``. Six small subjects with three stages each,
+the last of which only waits, so that it is not the work that is measured but what starts it: doit with
+``-n 2``, a batch on a local Ray that it starts by itself, and a batch on a Ray cluster of two one-CPU nodes
+that already runs. All of them begin every stage as a process of its own and have two subjects at a time. Then
+the same again with everything done: the cost of looking at the store.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
-import json
 import math
 import os
 import subprocess
@@ -21,33 +20,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks import frame
 from pipeline.config.workspace import REPOSITORY
+from pipeline.errors import UserError
 from pipeline.run.ray_batch import import_ray, without_dashboard
 
 SUBJECTS, AT_ONCE, STEPS = 6, 2, 20
 STAGES = "tests.pipeline.toy_stages"
-
-
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One way to run the subjects.
-
-    Attributes:
-        name: of the way.
-        wall: seconds from the command to its end, everything to do.
-        again: the same with everything done.
-        ideal: seconds that the last stages wait, two at a time.
-    """
-
-    name: str
-    wall: float
-    again: float
-    ideal: float
-
-    @property
-    def overhead(self) -> float:
-        """Seconds a subject beside the waiting."""
-        return (self.wall - self.ideal) / SUBJECTS
 
 
 def make_project(root: Path) -> None:
@@ -73,7 +52,7 @@ def run(root: Path, seconds: float, *words: str) -> float:
     done = subprocess.run(line, cwd=REPOSITORY, env=environment, capture_output=True, text=True, check=False)
     wall = time.monotonic() - start
     if done.returncode:
-        raise SystemExit(f"{' '.join(line)} failed:\n{done.stdout}{done.stderr}")
+        raise UserError(f"{' '.join(line)} failed:\n{done.stdout}{done.stderr}")
     return wall
 
 
@@ -95,8 +74,9 @@ def running_cluster() -> Iterator[str]:
             cluster.shutdown()
 
 
-def measure(seconds: float) -> list[Row]:
-    """All ways, one after the other."""
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Runs all ways, one after the other."""
+    seconds = 1.0 if options.quick else 5.0
     ideal = math.ceil(SUBJECTS / AT_ONCE) * seconds
     with running_cluster() as address:
         ways = {
@@ -104,37 +84,25 @@ def measure(seconds: float) -> list[Row]:
             "batch, a local Ray started": ("batch", "cluster=local"),
             "batch, a cluster that runs": ("batch", f"cluster={address}"),
         }
-        rows = []
         for name, words in ways.items():
             with tempfile.TemporaryDirectory() as folder:
                 make_project(Path(folder))
                 wall = run(Path(folder), seconds, *words)
-                rows.append(Row(name, wall, run(Path(folder), seconds, *words), ideal))
-                print(f"{name}: {wall:.1f} s", file=sys.stderr, flush=True)
-    return rows
+                again = run(Path(folder), seconds, *words)
+            overhead = (wall - ideal) / SUBJECTS
+            row = {"way": name, "wall_s": wall, "ideal_s": ideal, "overhead_a_subject_s": overhead}
+            report.add(row | {"all_done_already_s": again})
+    doit, local, cluster = report.tables["rows"]
+    more = cluster["overhead_a_subject_s"] - doit["overhead_a_subject_s"]
+    start = local["wall_s"] - cluster["wall_s"]
+    running = f"Ray on a running cluster costs {more:+.2f} s a subject against -n"
+    return f"{running}; starting one costs {start:.1f} s"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print the table and its headline."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="stages of one second in place of five")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
-    options = parser.parse_args(arguments)
-    seconds = 1.0 if options.quick else 5.0
-    rows = measure(seconds)
-    print(f"{SUBJECTS} subjects, {AT_ONCE} at a time, {seconds:g} s of waiting each")
-    print(f"{'':28} {'wall s':>7} {'ideal s':>8} {'overhead a subject s':>21} {'all done already s':>19}")
-    for row in rows:
-        print(f"{row.name:28} {row.wall:7.1f} {row.ideal:8.1f} {row.overhead:21.2f} {row.again:19.1f}")
-    if options.json:
-        table = [{**dataclasses.asdict(row), "overhead": row.overhead} for row in rows]
-        options.json.write_text(json.dumps(table, indent=1) + "\n")
-    more = rows[2].overhead - rows[0].overhead
-    start = rows[1].wall - rows[2].wall
-    print(
-        f"Ray on a running cluster costs {more:+.2f} s a subject against -n; starting one costs {start:.1f} s"
-    )
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("cluster", __doc__, measure, arguments)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,6 +1,7 @@
-"""What the registration is worth and what it costs: ``python -m benchmarks.fit [--quick] [--json FILE]``.
+"""The registration's error against the truth of mannequins, and its cost.
 
-Three tables, of which ``--detectors``, ``--framings``, ``--variants`` and ``--no-effort`` choose a part:
+Holds: docs/results.md, "Registration". Three tables, of which ``--detectors``, ``--framings``, ``--variants``
+and ``--no-effort`` choose a part:
 
 - errors against the truth of mannequins in each framing (see ``fit_truth.py``), for the fit as it is and for
   fits that lack one thing each. ``tau = 0`` trusts every score but still masks what lies outside the
@@ -17,12 +18,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
-import platform
+import itertools
 import statistics
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.fit_truth import ANCHORS, SOURCES, Errors, Stage, TrueClip, load_stage, make_clips, measure
+from benchmarks import frame
+from benchmarks.fit_truth import SOURCES, Errors, Stage, TrueClip, load_stage, make_clips, measure
 from pipeline.body import (
     Identity,
     expression_offsets,
@@ -68,7 +69,7 @@ IDENTITIES = (1, 2)
 FRAMES, QUICK_FRAMES = 30, 8
 EFFORTS, QUICK_EFFORTS = (25, 50, 100, 200, 400), (10, 20)
 QUICK_ITERATIONS = 20  # of the error table: enough to see that it runs
-COLUMNS = ("joints", "Procrustes", "body", "surface", "pixels")
+COLUMNS = ("joints", "procrustes", "body", "surface", "pixels")
 _REPEATS = 7  # of the posing cost; the least time counts
 _POSED_FRAMES = 64
 
@@ -87,67 +88,42 @@ class Run:
     errors: Errors
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure, print the tables and one headline line."""
-    options = _options(arguments)
-    stage = load_stage()
-    quick = options.quick
-    print(f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}")
-    detectors, framings = tuple(options.detectors), tuple(options.framings)
-    clips = {framing: list(_clips(framing, stage, detectors, quick, options.bvh)) for framing in framings}
-
+def measure_fit(options: argparse.Namespace, report: frame.Report) -> str:
+    """Fits every clip in every variant; errors in mm (joints, surface aligned at the anchor) and pixels."""
+    stage, quick = load_stage(), options.quick
+    detectors = tuple(options.detectors or (SOURCES[:1] if quick else SOURCES))
+    clips = {name: list(clips_of(name, stage, detectors, quick, options.bvh)) for name in options.framings}
+    base = FitSettings(iterations=QUICK_ITERATIONS) if quick else FitSettings()
     runs: list[Run] = []
-    for detector in detectors:
-        for framing in framings:
-            chosen = [clip for clip in clips[framing] if clip.detector == detector]
-            iterations = QUICK_ITERATIONS if quick else None
-            for line in _error_table(chosen, stage, runs, options.variants, iterations):
-                print(line, flush=True)
-    cost = posing_cost(stage, 4 if quick else _POSED_FRAMES)
-    print(f"\nposing, forward and backward: landmarks {cost[0]:.1f} ms, whole mesh {cost[1]:.1f} ms")
-    effort: list[Run] = []
-    if not options.no_effort:
-        first = [clips[framing][0] for framing in framings]
-        for line in _effort_table(first, stage, QUICK_EFFORTS if quick else EFFORTS, effort):
-            print(line, flush=True)
-    if options.json is not None:
-        record = {"errors": runs, "effort": effort}
-        lists = {name: [dataclasses.asdict(run) for run in many] for name, many in record.items()}
-        posing = {"landmarks_ms": cost[0], "mesh_ms": cost[1]}
-        options.json.write_text(json.dumps({**lists, "posing": posing}, indent=1) + "\n")
-    if options.figure is not None and effort:
-        draw_effort(effort, options.figure)
-    print(headline(runs, cost))
+    for detector, framing, variant in itertools.product(detectors, options.framings, options.variants):
+        settings = dataclasses.replace(base, **VARIANTS[variant])
+        chosen = (clip for clip in clips[framing] if clip.detector == detector)
+        many = [fit(clip, stage, variant, settings) for clip in chosen]
+        report.add({"keypoints": detector, "framing": framing, "variant": variant, **means(many)}, "errors")
+        runs += many
+    landmarks, mesh = posing_cost(stage, 4 if quick else _POSED_FRAMES)
+    report.add({"landmarks_ms": landmarks, "mesh_ms": mesh}, "posing")
+    efforts = () if options.no_effort else QUICK_EFFORTS if quick else EFFORTS
+    for iterations in efforts:
+        first = (clips[framing][0] for framing in options.framings)
+        many = [fit(clip, stage, MASKED, FitSettings(iterations=iterations)) for clip in first]
+        report.add({"iterations": iterations, **means(many)}, "effort")
+    if options.figure is not None and efforts:
+        draw_effort(report.tables["effort"], options.figure)
+    return headline(runs, (landmarks, mesh))
 
 
-def _options(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fit", description="Measure the fit stage.")
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="one short clip a framing, one detector, few iterations: figures that mean nothing",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every single run there")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw error against seconds (PNG)")
     parser.add_argument("--bvh", type=Path, metavar="FILE", help="a motion to add to the full framing")
-    parser.add_argument(
-        "--detectors", nargs="+", choices=SOURCES, help="whose errors the keypoints have (all of them)"
-    )
+    parser.add_argument("--detectors", nargs="+", choices=SOURCES, help="whose errors the keypoints have")
     parser.add_argument("--framings", nargs="+", choices=FRAMINGS, default=FRAMINGS, help="all of them")
-    parser.add_argument(
-        "--variants",
-        nargs="+",
-        choices=VARIANTS,
-        default=list(VARIANTS),
-        help="rows of the error tables (all)",
-    )
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), help="all of them")
     parser.add_argument("--no-effort", action="store_true", help="leave out error against seconds")
-    options = parser.parse_args(arguments)
-    options.detectors = options.detectors or (SOURCES[:1] if options.quick else SOURCES)
-    return options
 
 
-def _clips(
+def clips_of(
     framing: str, stage: Stage, detectors: tuple[str, ...], quick: bool, bvh: Path | None
 ) -> Iterator[TrueClip]:
     """The clips of a framing, as each detector sees them."""
@@ -176,39 +152,6 @@ def fit(clip: TrueClip, stage: Stage, variant: str, settings: FitSettings) -> Ru
         100 * seconds / spec.frames,
         measure(registration.identity, registration.poses, clip, stage),
     )  # fmt: skip
-
-
-def _error_table(
-    clips: list[TrueClip], stage: Stage, runs: list[Run], variants: list[str], iterations: int | None = None
-) -> Iterator[str]:
-    """Fit the clips of one framing and detector in each variant; append the runs, yield lines."""
-    base = FitSettings() if iterations is None else FitSettings(iterations=iterations)
-    framing, detector = clips[0].spec.framing, clips[0].detector
-    yield (
-        f"\n{framing}, {detector} keypoints, {len(clips)} clips of {clips[0].spec.frames} frames; what is "
-        f"seen, mm aligned at the {ANCHORS[framing]} (Procrustes: by the seen joints), px of "
-        f"{clips[0].spec.size}"
-    )
-    yield _row("", *COLUMNS, "s/100 fr.")
-    for variant in variants:
-        settings = dataclasses.replace(base, **VARIANTS[variant])
-        many = [fit(clip, stage, variant, settings) for clip in clips]
-        runs.extend(many)
-        yield _row(variant, *_cells(many))
-
-
-def _effort_table(
-    clips: list[TrueClip], stage: Stage, efforts: tuple[int, ...], runs: list[Run]
-) -> Iterator[str]:
-    """Fit one clip of each framing with every effort; append the runs, yield lines."""
-    names = ", ".join(clip.spec.framing for clip in clips)
-    yield f"\neffort in iterations, {clips[0].detector} keypoints, mean of one clip each of {names}"
-    yield _row("", *COLUMNS, "s/100 fr.")
-    for iterations in efforts:
-        settings = FitSettings(iterations=iterations)
-        many = [fit(clip, stage, MASKED, settings) for clip in clips]
-        runs.extend(many)
-        yield _row(str(iterations), *_cells(many))
 
 
 def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
@@ -245,38 +188,28 @@ def posing_cost(stage: Stage, frames: int) -> tuple[float, float]:
 
     away = (of_landmarks(start) - of_mesh(start)).norm(dim=-1).max()
     assert away < 1e-3, f"landmarks posed alone are {float(away):.4f} m from those of the mesh"
-    times: dict[str, list[float]] = {"landmarks": [], "mesh": []}
-    for _ in range(_REPEATS):
-        times["landmarks"].append(_milliseconds(of_landmarks, start))
-        times["mesh"].append(_milliseconds(of_mesh, start))
-    return min(times["landmarks"]), min(times["mesh"])
-
-
-def _milliseconds(pose: Callable[[Parameters], Tensor], start: Parameters) -> float:
-    """One forward and one backward pass through every parameter."""
-    leaves = start.leaves()
     with threads(1):
-        started = time.perf_counter()
-        pose(leaves).square().sum().backward()
-        return 1e3 * (time.perf_counter() - started)
+        ways = {"landmarks": of_landmarks, "mesh": of_mesh}
+        jobs = {name: lambda way=way: both_passes(way, start) for name, way in ways.items()}
+        times = frame.least(jobs, _REPEATS, "wall")
+    return times["landmarks"], times["mesh"]
 
 
-def draw_effort(runs: list[Run], path: Path) -> None:
-    """Draw the error of seen joints against seconds, the iterations written beside each point."""
+def both_passes(pose: Callable[[Parameters], Tensor], start: Parameters) -> None:
+    """One forward and one backward pass through every parameter."""
+    pose(start.leaves()).square().sum().backward()
+
+
+def draw_effort(rows: Iterable[dict[str, Any]], path: Path) -> None:
+    """Draws the error of seen joints against seconds, the iterations written beside each point."""
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    efforts = sorted({run.iterations for run in runs})
-    points = [_effort_point([run for run in runs if run.iterations == effort]) for effort in efforts]
-    axes.plot(*zip(*points, strict=True), marker="o")
-    for iterations, point in zip(efforts, points, strict=True):
+    points = {row["iterations"]: (row["s_per_100_frames"], row["joints"]) for row in rows}
+    axes.plot(*zip(*points.values(), strict=True), marker="o")
+    for iterations, point in points.items():
         axes.annotate(str(iterations), point, textcoords="offset points", xytext=(4, 4), fontsize=8)
     axes.set(xscale="log", xlabel="seconds per 100 frames", ylabel="seen joints, mm (aligned at one joint)")
     figure.savefig(path, dpi=150, metadata={"Software": None})
-
-
-def _effort_point(runs: list[Run]) -> tuple[float, float]:
-    seconds = statistics.mean(run.seconds_per_100_frames for run in runs)
-    return seconds, statistics.mean(run.errors.joints for run in runs)
 
 
 def headline(runs: list[Run], cost: tuple[float, float]) -> str:
@@ -294,7 +227,7 @@ def headline(runs: list[Run], cost: tuple[float, float]) -> str:
             ratios.append(f"{framing} {tau / masked:.2f} and {none / masked:.2f}")
         parts.append(f"{detector}: {', '.join(ratios)}")
     return (
-        f"fit: error of seen joints at tau = 0 and without mask, times that of the mask; {'; '.join(parts)}; "
+        f"error of seen joints at tau = 0 and without mask, times that of the mask; {'; '.join(parts)}; "
         f"posing landmarks costs {cost[0] / cost[1]:.3f} of the mesh"
     )
 
@@ -304,18 +237,17 @@ def _mean_joints(runs: list[Run]) -> float:
     return statistics.mean(run.errors.joints for run in runs) if runs else float("nan")
 
 
-def _cells(runs: list[Run]) -> list[str]:
-    """The means over clips, as the columns of a table."""
-    names = ("joints", "procrustes", "body", "surface", "pixels")
-    means = [statistics.mean(getattr(run.errors, name) for run in runs) for name in names]
+def means(runs: list[Run]) -> dict[str, Any]:
+    """The means over clips, as the columns of a table, and every run."""
+    found = {name: statistics.mean(getattr(run.errors, name) for run in runs) for name in COLUMNS}
     seconds = statistics.mean(run.seconds_per_100_frames for run in runs)
-    return [*(f"{mean:.1f}" for mean in means[:-1]), f"{means[-1]:.2f}", f"{seconds:.1f}"]
+    return found | {"s_per_100_frames": seconds, "runs": [dataclasses.asdict(run) for run in runs]}
 
 
-def _row(*cells: str) -> str:
-    widths = (16, 8, 11, 8, 8, 8, 10)
-    return " ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("fit", __doc__, measure_fit, arguments, options=add_options)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

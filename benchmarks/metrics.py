@@ -1,64 +1,41 @@
-"""What metrics cost, and how far they are from others' code.
+"""The time of each metric, and its difference from others' code.
 
-``python -m benchmarks.metrics [--quick] [--json FILE]``
-One picture of 512 x 288 against another, one thread, processor milliseconds, the least of a few rounds in
-turn. Agreement is the largest difference over some pairs of pictures from scikit-image (PSNR, SSIM) and
-torchmetrics (SSIM in float64); that of LPIPS with its authors' package is held by
-``tests/unit/test_metrics.py``.
+Holds: docs/results.md, "Metrics and protocols". One picture of 512 x 288 against another, one thread,
+processor milliseconds, the least of a few rounds in turn. Agreement is the largest difference over some pairs
+of pictures from scikit-image (PSNR, SSIM) and torchmetrics (SSIM in float64); that of LPIPS with its authors'
+package is held by ``tests/unit/test_metrics.py``.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks import machine
+from benchmarks import frame
 from pipeline.config.workspace import open_workspace
 from pipeline.metrics import Lpips, interior, psnr, ssim
 from pipeline.metrics.flicker import flicker
 from pipeline.metrics.intervals import interval
 
 WIDTH, HEIGHT = 512, 288
+LPIPS = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 FACE = (slice(60, 180), slice(190, 310))  # a crop of 120 pixels
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, print; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.metrics", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one round, LPIPS with AlexNet alone")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every number there")
-    options = parser.parse_args(arguments)
-    machine.prepare("benchmarks.metrics", 1)
-    costs = measured(candidates(options.quick), 1 if options.quick else 5)
-    apart = agreement(2 if options.quick else 8)
-    print(machine.described())
-    print(f"{'metric':28} {'ms a picture':>12}")
-    for name, milliseconds in costs.items():
-        print(f"{name:28} {milliseconds:12.2f}")
-    for name, difference in apart.items():
-        print(f"{name:40} {difference:.1e}")
-    if options.json is not None:
-        options.json.write_text(json.dumps({"milliseconds": costs, "agreement": apart}, indent=1) + "\n")
-    vgg = (
-        f", LPIPS VGG {costs['lpips_vgg'] / costs['lpips_alex']:.0f} times Alex"
-        if "lpips_vgg" in costs
-        else ""
-    )
-    lpips = (
-        f" and LPIPS Alex {costs['lpips_alex'] / costs['ssim']:.1f} times SSIM"
-        if "lpips_alex" in costs
-        else ""
-    )
-    print(f"metrics: SSIM costs {costs['ssim'] / costs['psnr']:.1f} times PSNR{lpips}{vgg}")
-    return 0
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Times all and compares."""
+    costs = frame.least(candidates(options.quick), 1 if options.quick else 5)
+    for name, cost in costs.items():
+        report.add({"metric": name, "ms a picture": cost}, "milliseconds")
+    for name, difference in agreement(2 if options.quick else 8).items():
+        report.add({"metric": name, "largest difference": difference}, "agreement")
+    lpips = (f"{name} {costs[name] / costs['ssim']:.1f} times SSIM" for name in costs if name in LPIPS)
+    return ", ".join([f"SSIM costs {costs['ssim'] / costs['psnr']:.1f} times PSNR", *lpips])
 
 
 def pair(seed: int, height: int = HEIGHT, width: int = WIDTH) -> tuple[Tensor, Tensor]:
@@ -73,7 +50,7 @@ def pair(seed: int, height: int = HEIGHT, width: int = WIDTH) -> tuple[Tensor, T
 
 
 def candidates(quick: bool) -> dict[str, Callable[[], object]]:
-    """Name -> what is timed."""
+    """Name -> what is timed; LPIPS, which asks for weights, is left out where it is to be quick."""
     image, truth = pair(0)
     mask = (truth.sum(-1) > 0.05).numpy().astype(np.uint8) * 255
     inside = interior(mask)
@@ -86,31 +63,17 @@ def candidates(quick: bool) -> dict[str, Callable[[], object]]:
         "flicker": lambda: flicker(image, truth, truth, image, inside),
         "interval of 30 frames": lambda: interval(scores),
     }
-    folder = open_workspace().assets / "lpips"
-    for name in ("alex",) if quick else ("alex", "vgg"):
-        if folder.is_dir():
-            network = Lpips(folder, name)
-            found[f"lpips_{name}"] = lambda network=network: _lpips(network, image, truth)
-            found[f"lpips_{name} of a face"] = lambda network=network: _lpips(
-                network, image[FACE], truth[FACE]
-            )
+    for name in () if quick else LPIPS:
+        network = Lpips(frame.asset_folder(open_workspace(), "lpips"), LPIPS[name])
+        for part, pair_of in {"": (image, truth), " of a face": (image[FACE], truth[FACE])}.items():
+            found[name + part] = lambda network=network, both=pair_of: lpips_of(network, *both)
     return found
 
 
 @torch.no_grad()
-def _lpips(network: Lpips, image: Tensor, truth: Tensor) -> object:
+def lpips_of(network: Lpips, image: Tensor, truth: Tensor) -> object:
     """As scored: the truth's features are computed once a frame, those of the picture each time."""
     return network.distance(network.features(image), network.features(truth))
-
-
-def measured(found: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """The least processor milliseconds of each, all in turn."""
-    least = dict.fromkeys(found, float("inf"))
-    for name in [*found, *(name for _ in range(rounds) for name in found)]:
-        start = time.process_time()
-        found[name]()
-        least[name] = min(least[name], 1000 * (time.process_time() - start))
-    return least
 
 
 def agreement(pairs: int) -> dict[str, float]:
@@ -137,6 +100,11 @@ def agreement(pairs: int) -> dict[str, float]:
         for name, difference in zip(apart, theirs, strict=True):
             apart[name] = max(apart[name], abs(float(difference)))
     return apart
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("metrics", __doc__, measure, arguments, threads=1)
 
 
 if __name__ == "__main__":

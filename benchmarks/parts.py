@@ -17,29 +17,27 @@ from torch import Tensor, nn
 
 
 class PartClock:
-    """Wall-clock and CPU seconds of each part.
-
-    CPU time is that of all the process's threads: on a machine that does other things besides, the ratio of
-    two CPU times means more than that of two wall-clock times.
+    """Seconds of each part.
 
     Attributes:
-        spent: part -> [wall-clock seconds, CPU seconds].
+        spent: part -> seconds.
     """
 
-    def __init__(self, rest: str):
+    def __init__(self, rest: str, now: Callable[[], float] = time.perf_counter):
         """Stands still until ``start``.
 
         Args:
-            rest: what the time outside of every other part counts as.
+            rest: the part that time outside of every other part counts as.
+            now: seconds, of ``frame.CLOCKS``.
         """
-        self.rest, self.spent = rest, dict[str, list[float]]()
+        self.rest, self.spent, self._now = rest, dict[str, float](), now
         self._part: str | None = None
-        self._since = (0.0, 0.0)
+        self._since = 0.0
 
     def start(self) -> None:
         """Forgets everything and starts."""
         self.spent.clear()
-        self._part, self._since = self.rest, _now()
+        self._part, self._since = self.rest, self._now()
 
     def stop(self) -> None:
         """Counts what has passed."""
@@ -47,11 +45,9 @@ class PartClock:
 
     def enter(self, part: str | None) -> None:
         """From now on time counts as this part's."""
-        now = _now()
+        now = self._now()
         if self._part is not None:
-            spent = self.spent.setdefault(self._part, [0.0, 0.0])
-            for kind in range(2):
-                spent[kind] += now[kind] - self._since[kind]
+            self.spent[self._part] = self.spent.get(self._part, 0.0) + now - self._since
         self._part, self._since = part, now
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -94,7 +90,3 @@ class _Mark(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         ctx.clock.enter(ctx.part)
         return gradient, None, None
-
-
-def _now() -> tuple[float, float]:
-    return time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""What benchmarks are run on: a body made of capsules, covered with flat Gaussians."""
+"""A body made of capsules and covered with flat Gaussians, for the rasterizer to draw."""
 
 from __future__ import annotations
 

@@ -1,16 +1,15 @@
-"""What guards and precision cost: ``python -m benchmarks.stability [--quick] [--json FILE]``.
+"""The cost of guards and of precision.
 
-Processor time on one thread, with and without each, in turns in one process; the least of the repeats counts.
-``benchmarks.drift`` is what the precisions of training come to.
+Holds: docs/stability.md, "What stability costs". Processor time on one thread, with and without each, in
+turns in one process; the least of the repeats counts. ``adds`` is what it adds to ``without``.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
+import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,23 +21,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks import frame
 from benchmarks.avatars import avatar_of
 from benchmarks.fit_truth import load_stage, make_clips
-from benchmarks.machine import described, prepare
-from benchmarks.step import Contestant, _adam, frames_of
+from benchmarks.step import Contestant, adam, frames_of
 from pipeline.avatar import save_avatar
 from pipeline.body import Poses, write_poses
 from pipeline.files import tables
 from pipeline.finite import finite, require_finite_files
 from pipeline.metrics import ssim
 from pipeline.store import artifact
-from stages.fit import adam, parameters
+from stages.fit import adam as fit_adam
+from stages.fit import parameters
 from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
 from stages.ingest.mannequin import MannequinSpec
-
-WORDS = {True: "kept", False: "dropped"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,51 +57,32 @@ class Cost:
     why: str
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Time all, print the table and one headline line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.stability", description="What guards cost.")
-    parser.add_argument("--quick", action="store_true", help="few repeats of small cases")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every number there")
-    options = parser.parse_args(arguments)
-    if arguments is None:
-        prepare("benchmarks.stability", 1)
-    torch.set_num_threads(1)
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Times all."""
     repeats = 2 if options.quick else 9
-    print(f"{described()}; ms of processor time, the least of {repeats}")
-    print(f"{'guard or precision':<58}{'without':>10}{'adds':>9}  ")
-    costs = []
+    costs = {}
     for cost in (
         *training(options.quick, repeats),
         *fitting(options.quick, repeats),
         *files(repeats),
         *precision(repeats),
     ):
-        costs.append(cost)
-        print(
-            f"{cost.what:<58}{cost.without:>10.2f}{cost.share:>9.2%}  {WORDS[cost.kept]}: {cost.why}",
-            flush=True,
-        )
-    if options.json is not None:
-        options.json.write_text(json.dumps([dataclasses.asdict(one) for one in costs], indent=1) + "\n")
-    print(headline(costs))
+        costs[cost.what] = cost.share
+        report.add(cost)
+    step = costs["training: gradients, one sum, every step"] + costs["training: parameters, every 250th step"]
+    fit = costs["fit: gradients, one sum, every step"] + costs["fit: six numbers that are no rotation"]
+    return f"guards add {step:.2%} to a step of training and {fit:.1%} to a step of the fit"
 
 
 def least(repeats: int, *jobs: Callable[[], object]) -> list[float]:
     """The least processor time of each job, milliseconds; they take turns."""
-    spent: list[list[float]] = [[] for _ in jobs]
-    for turn in range(repeats + 1):
-        for job, times in zip(jobs, spent, strict=True):
-            start = time.process_time()
-            job()
-            if turn:  # the first one compiles and warms up
-                times.append(1e3 * (time.process_time() - start))
-    return [min(times) for times in spent]
+    return list(frame.least({str(place): job for place, job in enumerate(jobs)}, repeats).values())
 
 
 def training(quick: bool, repeats: int) -> Iterator[Cost]:
     """The gradients of a step, looked at in three ways, and the parameters."""
     avatar = avatar_of(2000 if quick else 10_000)
-    contestant = Contestant("ours", avatar, _adam(avatar, fused=True), shared=True)
+    contestant = Contestant("ours", avatar, adam(avatar, fused=True), shared=True)
     frames = frames_of(avatar, 1, 128 if quick else 256)
 
     def backward() -> None:
@@ -159,7 +138,7 @@ def fitting(quick: bool, repeats: int) -> Iterator[Cost]:
         register(stage.body, stage.landmarks, clip.keypoints, clip.cameras, settings)
 
     def fit_unguarded() -> None:
-        with without(adam, "require_finite_gradient", lambda *arguments: None):
+        with without(fit_adam, "require_finite_gradient", lambda *arguments: None):
             fit()
 
     def fit_trusting() -> None:
@@ -249,13 +228,10 @@ def single_ssim(image: Tensor, truth: Tensor) -> float:
     )
 
 
-def headline(costs: list[Cost]) -> str:
-    """One line."""
-    of = {cost.what: cost.share for cost in costs}
-    step = of["training: gradients, one sum, every step"] + of["training: parameters, every 250th step"]
-    fit = of["fit: gradients, one sum, every step"] + of["fit: six numbers that are no rotation"]
-    return f"stability: guards add {step:.2%} to a step of training and {fit:.1%} to a step of the fit"
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("stability", __doc__, measure, arguments, threads=1)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

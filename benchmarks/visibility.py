@@ -1,48 +1,49 @@
-"""What the visibility gate and the plan are worth, on mannequins and real subjects in three framings.
+"""The worth of the visibility gate, on mannequins and, if asked for, real subjects.
 
-    python -m benchmarks.visibility --subjects mannequin_head,smile --json FILE
-    python -m benchmarks.visibility --quick                 one mannequin, a few iterations
-    python -m benchmarks.visibility --only plans            every subject's plan, nothing is trained
-    python -m benchmarks.visibility --only gradients --figure FOLDER
-
-Subjects are read from the store, as ``doit run plan:NAME`` left them. Each variant trains for the same few
-iterations, without subdivision unless asked, and is scored on the same few held-out frames. "off" means that
-every body vertex carries a Gaussian from the start to the end. Seconds a step are medians over steps of all
-variants in turn, after training, so that whatever else the machine does meets all of them alike.
+Holds: docs/results.md, "Visibility". Each variant trains for the same few iterations, without subdivision
+unless asked, and is scored on the same few held-out frames. "off": every body vertex carries a Gaussian from
+the start to the end. Steps are timed in turn after training, medians of CPU time. ``outside`` and ``ghost``
+are what a camera that never was sees of what no frame showed: the mean absolute difference from the truth
+there (mannequins), and the pixels covered there, from a camera farther back. ``cut`` and ``lost`` are the
+shares of vertices and of an average frame's visible body under the threshold tau.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import statistics
-import time
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
+from torch import Tensor
 
-from benchmarks.machine import described, prepare
-from benchmarks.visibility_pictures import gradient_picture, unseen_error
+from benchmarks import frame
+from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.otsu_threshold import evidence_threshold
-from pipeline.clip.plan import EFFECTS, Plan, read_plan
+from pipeline.avatar.visibility import body_in_frame
+from pipeline.body import joint_transforms
+from pipeline.clip.camera import Camera, facing_camera, project
+from pipeline.clip.composite import composite_frame
+from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.plan import Plan, read_plan
+from pipeline.clip.records import read_cameras
 from pipeline.config.request import parse_request
-from pipeline.errors import UserError
 from pipeline.metrics import Lpips, psnr, ssim
-from pipeline.run.job import Job, open_job
-from pipeline.splat import render
+from pipeline.run.job import open_job
+from pipeline.splat import Rendering, render
 from stages.plan.measure import read_inputs, visibility
 from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
 from stages.train.run import build_trainer
 from stages.train.settings import TrainSettings, apply_plan
-from stages.train.visibility_gate import VisibilityGate
 
-SUBJECTS = ("mannequin_full", "mannequin_upper", "mannequin_head", "smile", "oliver", "balance")
-ALL = (*SUBJECTS, "carphone")
-HEAD_ONLY = ("mannequin_head", "smile")
+SUBJECTS = ("mannequin_full", "mannequin_upper", "mannequin_head")
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "on": {},
     "off": {"gate": False},
@@ -50,171 +51,153 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "fixed 0.4": {"gate_threshold": 0.4},
     "fixed 0.6": {"gate_threshold": 0.6},
 }
+VIEW = "above"  # of the mannequin's unseen cameras, the one that shows most of what no frame did
+BACK = 2.2  # metres that the wide camera stands behind the filming one
+REACH = 6  # pixels about a seen vertex that count as the seen region
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """A subject as the store has it.
+    """A subject as the stages up to plan left it.
 
     Attributes:
         name: the subject's.
-        job: with every stage's settings.
-        data: what train reads.
+        data: for training.
         plan: of the subject.
-        clip: what the plan looked at.
+        threshold: the gate's from fitted poses: tau, Otsu's, its separability, what it cuts and loses.
+        views: folder of a mannequin's unseen cameras; need not exist.
     """
 
     name: str
-    job: Job
     data: TrainingData
     plan: Plan
-    folders: Mapping[str, Path]
+    threshold: dict[str, Any]
+    views: Path
 
 
-def open_subject(name: str) -> Subject:
-    """Reads a subject.
-
-    Raises:
-        UserError: the store has no plan of it under the present settings.
-    """
-    job = open_job(name, parse_request({}, name))
-    folders = {}
-    for stage in ("ingest", "fit", "plan"):
-        artifact = job.find(stage)
-        if artifact is None:
-            raise UserError(f"{name} has no {stage} in the store: doit run plan:{name}")
-        folders[stage] = artifact.folder
-    plan, margin = read_plan(folders["plan"] / "plan.json"), TrainSettings().crop_margin
-    data = read_training_data(folders["ingest"], folders["fit"], None, job.workspace.body_file, margin)
-    return Subject(name, job, data, plan, folders)
+def open_subject(name: str, words: Mapping[str, str]) -> Subject:
+    """Reads a subject; the stages up to plan run first where the store lacks them."""
+    job = open_job(name, parse_request(words, name))
+    ingest, fit, plan = (frame.made(job, "plan")[stage].folder for stage in ("ingest", "fit", "plan"))
+    margin, body_file = TrainSettings().crop_margin, job.workspace.body_file
+    scores, _ = visibility(read_inputs(ingest, fit, body_file))
+    data = read_training_data(ingest, fit, None, body_file, margin)
+    threshold = dataclasses.asdict(evidence_threshold(scores))
+    return Subject(name, data, read_plan(plan / "plan.json"), threshold, ingest / "views" / VIEW)
 
 
-def trainer_of(subject: Subject, settings: TrainSettings, plan: Plan | None = None) -> Trainer:
-    """A trainer as the stage makes it."""
-    return build_trainer(subject.data, settings if plan is None else apply_plan(settings, plan))
+def measure(options: argparse.Namespace, report: frame.Report) -> str:
+    """Trains every variant of every subject."""
+    quick = {"ingest__mannequin_frames": "24", "fit__iterations": "50"} if options.quick else {}
+    names = ("mannequin_head",) if options.quick else SUBJECTS
+    with frame.settings_of(options, **quick) as words:
+        for name in options.subjects.split(",") if options.subjects else names:
+            subject = open_subject(name, words)
+            report.add({"subject": name, **subject.threshold}, "thresholds")
+            network = Lpips(frame.asset_folder(parse_request(words, name).workspace, "lpips"), "alex")
+            for row in compare(subject, options, network):
+                report.add(row)
+    return headline(report.tables["rows"])
 
 
-def scored(subject: Subject, trainer: Trainer, frames: tuple[int, ...], network: Lpips) -> dict[str, float]:
-    """Held-out PSNR, SSIM and LPIPS of the person on black, and an animation's frame."""
-    values: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": [], "animation_ms": []}
-    avatar = trainer.avatar.eval()
-    clip = subject.data.clip
-    with torch.no_grad():
-        for frame in frames:
-            pose, view = clip.pose(frame), subject.data.whole[frame]
-            avatar.gaussians(pose, clip.seconds.get(frame))
-            start = time.perf_counter()
-            gaussians = avatar.gaussians(pose, clip.seconds.get(frame))
-            values["animation_ms"].append(1e3 * (time.perf_counter() - start))
-            image, truth = render(gaussians, view.camera).color.clamp(0, 1), view.composite(torch.zeros(3))
-            values["psnr"].append(psnr(image, truth))
-            values["ssim"].append(ssim(image, truth))
-            values["lpips"].append(float(network(image, truth)[0]))
-    avatar.train()
-    means = {name: statistics.fmean(each) for name, each in values.items()}
-    return means | {"animation_ms": min(values["animation_ms"]), "megabytes": megabytes(trainer)}
-
-
-def megabytes(trainer: Trainer) -> float:
-    """What the Gaussians of a finished avatar take: canonical constants, features and decoded values."""
-    surface = trainer.avatar.surface()
-    with torch.no_grad():
-        decoded = trainer.avatar.decode()
-    owners = (surface.canonical, surface.skinning_tables, decoded)
-    tensors = [one for owner in owners for one in vars(owner).values() if isinstance(one, torch.Tensor)]
-    for pair in (surface.samples, surface.neighbours):
-        for matrix in (pair.matrix, pair.transpose):
-            tensors += [matrix.values(), matrix.col_indices(), matrix.crow_indices()]
-    return sum(one.numel() * one.element_size() for one in tensors) / 2**20
-
-
-def in_turn(trainers: Mapping[str, Trainer], rounds: int) -> dict[str, float]:
-    """Median CPU milliseconds of a step of each trainer, taken in turn."""
-    spent: dict[str, list[float]] = {name: [] for name in trainers}
-    for _ in range(rounds):
-        for name, trainer in trainers.items():
-            start = time.process_time()
-            trainer.step()
-            spent[name].append(1e3 * (time.process_time() - start))
-    return {name: statistics.median(each) for name, each in spent.items()}
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
+    parser.add_argument("--subjects", metavar="NAMES", help=f"joined by commas; {','.join(SUBJECTS)} if none")
+    parser.add_argument("--variants", default="on,off", help=f"of {', '.join(VARIANTS)}; joined by commas")
+    parser.add_argument("--iterations", type=int, help="of training (200)")
+    parser.add_argument("--subdivisions", type=int, default=0)
+    parser.add_argument("--frames", type=int, help="held-out frames that are scored (4)")
+    parser.add_argument("--rounds", type=int, help="timed steps of each variant (9)")
+    frame.stage_options(parser)
 
 
 def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> list[dict[str, Any]]:
-    """Trains every variant of one subject and scores it."""
-    frames = subject.data.clip.spread(options.frames, "test")
+    """A row a variant."""
+    iterations, frames, rounds = (20, 2, 3) if options.quick else (200, 4, 9)
+    iterations = options.iterations or iterations
     trainers, rows = {}, []
-    for name in options.variants:
-        forced = name == "forced"
-        changes = {"gate": False} if forced else VARIANTS[name]
+    for name in options.variants.split(","):
         settings = dataclasses.replace(
-            TrainSettings(), iterations=options.iterations, subdivisions=options.subdivisions,
-            subdivide_from=0.0, checkpoint_every=10**6, **changes,
+            TrainSettings(), iterations=iterations, subdivisions=options.subdivisions,
+            subdivide_from=0.0, checkpoint_every=10**6, **VARIANTS[name],
         )  # fmt: skip
-        start = time.process_time()
-        trainer = trainer_of(subject, settings, None if forced else subject.plan)
-        while trainer.iteration < options.iterations:
+        trainer = build_trainer(subject.data, apply_plan(settings, subject.plan))
+        while trainer.iteration < iterations:
             trainer.step()
-        row = {"subject": subject.name, "variant": name, "seconds": time.process_time() - start}
-        row |= {"gaussians": len(trainer.avatar), **scored(subject, trainer, frames, network)}
-        gate = trainer.hooks.get("gate")
-        threshold = gate.threshold if isinstance(gate, VisibilityGate) else None
-        row |= {"tau": threshold.tau if threshold else 0.0}
-        row |= {"views": unseen_error(subject, trainer, options.figure)}
-        rows.append(row)
-        trainers[name] = trainer
-        print(f"  {subject.name} {name}: {row['psnr']:.2f} dB, {row['gaussians']} Gaussians", flush=True)
-    for name, value in in_turn(trainers, options.rounds).items():
-        next(row for row in rows if row["variant"] == name)["step_ms"] = value
-    return rows
-
-
-def threshold_of(subject: Subject) -> dict[str, Any]:
-    """The gate's threshold, from fitted poses."""
-    inputs = read_inputs(subject.folders["ingest"], subject.folders["fit"], subject.job.workspace.body_file)
-    scores, _ = visibility(inputs)
-    return {"subject": subject.name, **dataclasses.asdict(evidence_threshold(scores))}
-
-
-def print_rows(rows: list[dict[str, Any]]) -> None:
-    """The table of variants."""
-    print("\n| subject | gate | Gaussians | step, CPU ms | PSNR | SSIM | LPIPS | animation ms | MB | tau |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    for row in rows:
-        print(
-            f"| {row['subject']} | {row['variant']} | {row['gaussians']} | {row['step_ms']:.0f} | "
-            f"{row['psnr']:.2f} | {row['ssim']:.4f} | {row['lpips']:.4f} | {row['animation_ms']:.1f} | "
-            f"{row['megabytes']:.1f} | {row['tau']:.2f} |"
+        row = {"subject": subject.name, "gate": name, "gaussians": len(trainer.avatar)}
+        rows.append(
+            row | scored(subject, trainer, options.frames or frames, network) | unseen(subject, trainer)
         )
-    for row in rows:
-        for view, value in row["views"].items():
-            print(f"{row['subject']} {row['variant']}, {view}: {value:.4f}")
+        trainers[name] = trainer
+    timed = {name: lambda one=one: frame.milliseconds(one.step) for name, one in trainers.items()}
+    steps = frame.in_turn(timed, options.rounds or rounds)
+    return [row | {"step_ms": statistics.median(steps[row["gate"]])} for row in rows]
 
 
-def print_plans(subjects: list[Subject]) -> None:
-    """Every subject's plan in one table: the number measured, bold where the effect is on."""
-    print("\n| effect | threshold | " + " | ".join(one.name for one in subjects) + " |")
-    print("|---" * (len(subjects) + 2) + "|")
-    for effect in EFFECTS:
-        made = [one.plan[effect] for one in subjects]
-        cells = [f"**on** {one.measured:.3g}" if one.on else f"off {one.measured:.3g}" for one in made]
-        print(f"| {effect} | {made[0].threshold:g} {made[0].unit} | {' | '.join(cells)} |")
+@torch.no_grad()
+def scored(subject: Subject, trainer: Trainer, count: int, network: Lpips) -> dict[str, float]:
+    """Held-out PSNR, SSIM and LPIPS of the person on black."""
+    values: dict[str, list[float]] = {"psnr": [], "ssim": [], "lpips": []}
+    avatar, clip = trainer.avatar.eval(), subject.data.clip
+    for number in clip.spread(count, "test"):
+        view = subject.data.whole[number]
+        gaussians = avatar.gaussians(clip.pose(number), clip.seconds.get(number))
+        image, truth = render(gaussians, view.camera).color.clamp(0, 1), view.composite(torch.zeros(3))
+        values["psnr"].append(psnr(image, truth))
+        values["ssim"].append(ssim(image, truth))
+        values["lpips"].append(float(network(image, truth)[0]))
+    avatar.train()
+    return {name: statistics.fmean(each) for name, each in values.items()}
 
 
-def print_thresholds(found: list[dict[str, Any]]) -> None:
-    """The gate's threshold of each subject, and why."""
-    print("\n| subject | Otsu | eta | mu_0 | tau | cut | lost | why |")
-    print("|---" * 8 + "|")
-    for one in found:
-        cells = [f"{one['otsu']:.2f}", f"{one['separability']:.2f}", f"{one['low_mean']:.3f}"]
-        cells += [f"{one['tau']:.2f}", f"{one['cut']:.1%}", f"{one['lost']:.2%}"]
-        print(f"| {one['subject']} | {' | '.join(cells)} | {one['why']} |")
+def unseen(subject: Subject, trainer: Trainer) -> dict[str, float | None]:
+    """``ghost`` and ``outside``, as described above."""
+    wide = facing_camera(256, 256, 1.2 * 256)
+    wide = dataclasses.replace(wide, translation=wide.translation + torch.tensor([0.0, 0.0, BACK]))
+    rendering, seen = rendered(subject, trainer, subject.data.clip.split.test[0], wide)
+    ghost, total, pixels = float(rendering.alpha[~seen].sum()), 0.0, 0
+    if not subject.views.is_dir():
+        return {"ghost": ghost, "outside": None}
+    for number, camera in read_cameras(subject.views / "cameras.parquet").items():
+        rendering, seen = rendered(subject, trainer, number, camera)
+        image, mask = (
+            read_frame(subject.views / "frames", number),
+            read_mask(subject.views / "masks", number),
+        )
+        error = (rendering.color.clamp(0, 1) - composite_frame(image, mask)).abs().mean(-1)
+        total += float(error[~seen].sum())
+        pixels += int((~seen).sum())
+    return {"ghost": ghost, "outside": total / max(1, pixels)}
+
+
+@torch.no_grad()
+def rendered(subject: Subject, trainer: Trainer, number: int, camera: Camera) -> tuple[Rendering, Tensor]:
+    """The avatar in a frame's pose, and the pixels near a vertex that a tenth of the training frames show."""
+    clip, avatar = subject.data.clip, trainer.avatar.eval()
+    pose = clip.pose(number)
+    rendering = render(avatar.gaussians(pose), camera)
+    avatar.train()
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    surface = Avatar(clip.body, clip.identity, torch.arange(len(clip.body.v_template)), bare).surfaces[0]
+    hits = torch.zeros(len(surface.canonical))
+    for one in clip.split.train:
+        hits += body_in_frame(surface, clip.pose(one), subject.data.crops.camera(one))
+    often, canonical = hits >= 0.1 * len(clip.split.train), surface.canonical
+    transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+    vertices = surface.skinning_tables.place(transforms, canonical.vertices, pose.transl)[0][often]
+    marks = np.zeros((camera.height, camera.width), np.uint8)
+    columns, lines = project(camera, vertices).round().int().numpy().T
+    inside = (columns >= 0) & (columns < camera.width) & (lines >= 0) & (lines < camera.height)
+    marks[lines[inside], columns[inside]] = 1
+    size = 2 * REACH + 1
+    return rendering, torch.from_numpy(cv2.dilate(marks, np.ones((size, size), np.uint8)) > 0)
 
 
 def headline(rows: list[dict[str, Any]]) -> str:
-    """One line: what the gate saves on heads, and what it costs."""
+    """One line: what the gate saves, and its cost."""
     parts = []
     for name in dict.fromkeys(row["subject"] for row in rows):
-        own = {row["variant"]: row for row in rows if row["subject"] == name}
+        own = {row["gate"]: row for row in rows if row["subject"] == name}
         if {"on", "off"} <= set(own):
             on, off = own["on"], own["off"]
             parts.append(
@@ -225,51 +208,10 @@ def headline(rows: list[dict[str, Any]]) -> str:
     return "; ".join(parts)
 
 
-def parsed() -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--subjects", type=lambda text: text.split(","), default=list(SUBJECTS))
-    parser.add_argument("--variants", type=lambda text: text.split(","), default=["on", "off"])
-    parser.add_argument("--iterations", type=int, default=200)
-    parser.add_argument("--subdivisions", type=int, default=0)
-    parser.add_argument("--frames", type=int, default=4, help="held-out frames that are scored")
-    parser.add_argument("--rounds", type=int, default=9, help="timed steps of each variant")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--only", choices=("plans", "train", "gradients"))
-    parser.add_argument("--figure", type=Path, help="folder for pictures")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    if options.quick:
-        options.subjects, options.iterations, options.frames, options.rounds = ["mannequin_head"], 20, 2, 3
-    return options
-
-
-def main() -> None:
-    """Runs what is asked for."""
-    options = parsed()
-    prepare("benchmarks.visibility", options.threads)
-    print(described())
-    subjects = [open_subject(name) for name in options.subjects]
-    result: dict[str, Any] = {"machine": described(), "rows": [], "thresholds": [], "gradients": {}}
-    if options.only in (None, "plans"):
-        result["thresholds"] = [threshold_of(one) for one in subjects]
-        print_thresholds(result["thresholds"])
-        print_plans(subjects)
-    if options.only in (None, "gradients"):
-        for one in subjects:
-            result["gradients"][one.name] = gradient_picture(one, options.figure, trainer_of)
-    if options.only in (None, "train"):
-        network = Lpips(subjects[0].job.workspace.assets / "lpips", "alex")
-        for one in subjects:
-            result["rows"] += compare(one, options, network)
-        print_rows(result["rows"])
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
-    print(headline(result["rows"]) or "nothing was trained")
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    return frame.run("visibility", __doc__, measure, arguments, threads=1, options=add_options)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -91,7 +91,7 @@ class Avatar(nn.Module):
             vertex_ids: [K] int64, the body vertices that carry Gaussians, sorted.
             architecture: sizes.
             seed: of the initial weights.
-            half_precision: whether the heads run in bfloat16.
+            half_precision: heads in bfloat16 where that is faster, see ``pipeline.device.product_dtype``.
         """
         super().__init__()
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity

@@ -82,6 +82,6 @@ class Head(nn.Module):
         layers = HeadParameters.of([self.first, *self.hidden, self.last], list(self.norms))
         if self.condition is None or condition is None:
             return layers
-        with autocast(condition.device, enabled=False):  # one small product: exact for nothing
+        with autocast(condition.device, half_precision=False):  # one small product: exact for nothing
             first = layers.biases[0] + self.condition(condition)
         return dataclasses.replace(layers, biases=(first, *layers.biases[1:]))

@@ -3,13 +3,13 @@
 A score v_i is the share of the frames that show vertex i (``visibility.py``). The paper's threshold is Otsu's
 tau*, which is right where the scores are bimodal: never seen, nearly always seen. On other clips Otsu finds a
 threshold all the same, and cuts what the clip does show. ``evidence_threshold`` tells the two apart by what
-is lost.
+of the clip would be lost.
 
 **The test.** A vertex of score v that is gated is missing from a share v of the frames. Averaged over
 frames, the part of the visible body that goes missing is therefore ``lost = sum of the scores under tau /
 sum of all scores``. A threshold is used only where
 
-1. ``lost`` is at most ``LARGEST_LOSS``: no more is taken from what the clip shows;
+1. ``lost`` is at most ``LARGEST_LOSS``;
 2. a valley lies there: scores between tau / 2 and 3 tau / 2 are at most ``LARGEST_VALLEY`` of those under
    tau. This is the paper's own argument for Otsu, that the threshold could be moved without harm;
 3. at least ``LEAST_CUT`` of all vertices lie under it, else it is not worth its bookkeeping.
@@ -102,7 +102,7 @@ def otsu_threshold(counts: np.ndarray) -> tuple[float, float, float]:
 
 
 def evidence_threshold(scores: np.ndarray, largest_loss: float = LARGEST_LOSS) -> Threshold:
-    """The threshold that passes the test of the module's docstring; an open gate if none does.
+    """Otsu's threshold if it passes the test of the module's docstring; else an open gate.
 
     Args:
         scores: [V] in [0, 1], of every vertex of the body.

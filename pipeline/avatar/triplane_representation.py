@@ -21,7 +21,7 @@ from pipeline.avatar.sparse import gather_rows, scatter_rows
 from pipeline.avatar.surface import Surface
 from pipeline.avatar.triplane import Triplane
 from pipeline.avatar.triplane_baking import bake_triplane
-from pipeline.device import autocast
+from pipeline.device import autocast, product_dtype
 
 
 class TriplaneRepresentation(Representation):
@@ -131,7 +131,7 @@ class TriplaneRepresentation(Representation):
 
     def bake(self, decoded: Decoded, pose_dependent: bool, residuals: bool) -> BakedRepresentation:
         """The heads with their first layers done as far as they can be."""
-        dtype = torch.bfloat16 if self._half_precision else torch.float32
+        dtype = product_dtype(self.triplane.planes.device, self._half_precision)
         heads = (self.pose_geometry, self.pose_color) if pose_dependent else None
         places = decoded.surface.residual if residuals else ()
         return bake_triplane(decoded.features, heads, self.residuals, places, dtype)

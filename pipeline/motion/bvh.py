@@ -59,7 +59,6 @@ def world_motion(bvh: Bvh, frames: np.ndarray) -> tuple[Tensor, Tensor]:
     """Each joint's orientation and place at some of the frames.
 
     Args:
-        bvh: the clip.
         frames: [K] indices of its table's rows.
 
     Returns:

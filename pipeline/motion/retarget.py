@@ -159,7 +159,7 @@ def match_joints(names: tuple[str, ...], origin: str = "the BVH skeleton") -> di
 
 
 def frame_indices(available: int, own_fps: float, count: int, fps: float) -> np.ndarray:
-    """Which rows of the capture's table show ``count`` frames at ``fps``: [count] int64."""
+    """The rows of the capture's table that show ``count`` frames at ``fps``: [count] int64."""
     rows = np.round(np.arange(count) * own_fps / fps).astype(np.int64)
     period = max(2 * (available - 1), 1)
     rows %= period

@@ -10,8 +10,8 @@
     cam_params/<frame>.json                               R [3][3], t [3], focal [2], princpt [2]
     frame_list_all.txt                                    the measured frames, one a line
 
-Poses are in the axes of each frame's own camera (``pose_files.axes``). Their world is the camera of the
-first frame: a camera that stands still has R = 1 and t = 0, as in their files.
+Poses are in the axes of each frame's own camera (``pose_files.camera_frame``). Their world is the camera
+of the first frame: a camera that stands still has R = 1 and t = 0, as in their files.
 
 Coefficients mean what they mean to the body that was fitted. Tools that build the official SMPL-X
 reproduce the fit only if it was made with the official SMPL-X. They are built with 100 betas and 50
@@ -38,7 +38,7 @@ from torch import Tensor
 from pipeline.body import BodyModel, Identity, Poses, rest_joints
 from pipeline.body.joints import BODY_POSE, JAW, LEFT_EYE, LEFT_HAND, RIGHT_EYE, RIGHT_HAND
 from pipeline.clip.camera import Camera
-from pipeline.pose_files.axes import HAND_JOINTS, into_camera, moved_pivot
+from pipeline.pose_files.camera_frame import HAND_JOINTS, into_camera, moved_pivot
 
 _BETAS, _EXPRESSIONS = 100, 50  # what the tools' models are built with
 _DIGITS = 7  # decimals: a tenth of a micrometre, a hundred-thousandth of a degree
@@ -60,12 +60,7 @@ def write_peer_files(
     """Write the files that the module's docstring lists.
 
     Args:
-        folder: made if it is not there.
-        body: the body that was fitted.
-        identity: beta, Delta J, Delta V_face.
-        raw: the poses as fitted.
         smoothed: the poses after smoothing, of the same frames.
-        cameras: frame number -> camera.
         hand_mean: [30, 3], what the tools will add to the hands, from ``read_hand_mean``.
 
     Raises:

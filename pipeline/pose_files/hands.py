@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
-from pipeline.pose_files.axes import HAND_JOINTS
-from pipeline.pose_files.read import InitialPoses, read_hand_mean
+from pipeline.pose_files.camera_frame import HAND_JOINTS
+from pipeline.pose_files.initial_poses import InitialPoses
 
 
 def with_flat_hands(
@@ -28,7 +28,6 @@ def with_flat_hands(
     """The same poses with hands relative to flat hands.
 
     Args:
-        poses: of any kind.
         body_file: the body model's file, for mean and components.
         official: whether the file is SMPL-X's, whose components the coefficients belong to.
         log: told in a line if the hands' coefficients could not be used.
@@ -52,6 +51,30 @@ def with_flat_hands(
             turned = torch.einsum("tsp,spk->tsk", coefficients, components[:, :count].to(rotation))
             rotation[:, HAND_JOINTS] += turned.reshape(len(rotation), 30, 3)
     return dataclasses.replace(poses, rotation=rotation, hands="flat", hand_pca=None)
+
+
+def read_hand_mean(body_file: Path) -> Tensor:
+    """The hand pose that a body file's hands are relative to in parameter files: [30, 3], radians.
+
+    It belongs to the model that the parameters were made with. The open body's own is a relaxed hand as
+    SMPL-X's is, but not the same: with it, estimates for the official model start with fingers that are
+    a few tenths of a radian too straight. Zero if the file has none.
+
+    Raises:
+        UserError: the file cannot be read, or holds something else under these names.
+    """
+    remedy = "use data/body/open_body.npz or a SMPL-X model file"
+    try:
+        with np.load(body_file, allow_pickle=False) as archive:
+            names = ("hands_meanl", "hands_meanr")
+            if not all(name in archive.files for name in names):
+                return torch.zeros(30, 3)
+            means = np.concatenate([np.asarray(archive[name], np.float32).reshape(15, 3) for name in names])
+    except (OSError, EOFError, ValueError, TypeError, AttributeError, BadZipFile) as error:
+        raise UserError(f"{body_file}: its mean hand pose cannot be read ({error}): {remedy}") from None
+    if not np.isfinite(means).all():
+        raise UserError(f"{body_file}: its mean hand pose is not finite: {remedy}")
+    return torch.from_numpy(means)
 
 
 def _components(body_file: Path) -> Tensor | None:

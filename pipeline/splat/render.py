@@ -33,13 +33,9 @@ def render(gaussians: Gaussians, camera: Camera, backend: str = "auto") -> Rende
     A single red Gaussian, two metres before the camera:
 
     >>> from pipeline.clip.camera import facing_camera
-    >>> red = Gaussians(
-    ...     means=torch.tensor([[0.0, 0.0, -2.0]]),
-    ...     quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-    ...     scales=torch.full((1, 3), 0.2),
-    ...     colors=torch.tensor([[1.0, 0.0, 0.0]]),
-    ...     opacities=torch.tensor([0.9]),
-    ... )
+    >>> mean, quaternion = torch.tensor([[0.0, 0.0, -2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    >>> scale, color = torch.full((1, 3), 0.2), torch.tensor([[1.0, 0.0, 0.0]])
+    >>> red = Gaussians(mean, quaternion, scale, color, torch.tensor([0.9]))
     >>> rendering = render(red, facing_camera(32, 32, focal=32.0))
     >>> rendering.color.shape, [round(value, 1) for value in rendering.color[16, 16].tolist()]
     (torch.Size([32, 32, 3]), [0.9, 0.0, 0.0])

@@ -11,7 +11,7 @@ from adjustText import adjust_text
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
 BLUE, ORANGE, GREY, INK = "#2f6fb3", "#c8641b", "#9aa3ab", "#22262a"
 LINES = ("#2f6fb3", "#c8641b", "#3f8f5f", "#8a5bb5", "#b5493f", "#6b7a86", "#b08a1e", "#2a9aa6")
@@ -161,14 +161,14 @@ def _log_axis(axes: Axes, values: pd.Series) -> None:
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
 
 
-def round_ticks(low: float, high: float, most: int = 7) -> list[float]:
-    """Round numbers in a range for a logarithmic axis: as many as fit, the roundest first."""
+def round_ticks(low: float, high: float) -> list[float]:
+    """Round numbers in a range for a logarithmic axis: evenly spaced in a short one, else 1, 2, 5, 10, ..."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ladders = ((1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9), (1, 1.5, 2, 3, 4, 6, 8), (1, 2, 3, 5), (1, 3), (1,))
-    ticks = [
-        [s * 10.0**d for d in decades for s in ladder if low <= s * 10.0**d <= high] for ladder in ladders
-    ]
-    return next((found for found in ticks if len(found) <= most), ticks[-1])
+    steps = (1, 2, 5) if len(decades) < 5 else (1,)
+    ticks = [step * 10.0**decade for decade in decades for step in steps]
+    if high < 5 * low:
+        ticks = list(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high))
+    return [tick for tick in ticks if low <= tick <= high]
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -63,7 +63,7 @@ METRICS: Mapping[str, Metric] = {
     **IMAGE,
     **REGIONS,
     **RUNTIME,
-    "psnr_interior": Metric("PSNR inside", 2, "higher"),
+    "psnr_interior": Metric("inside", 2, "higher"),
     "train_s": Metric("training s", 0, "lower"),
     "times": Metric("× base", 2),
     "gain": Metric("gain dB", 2),

@@ -275,15 +275,15 @@ def tables_of(study: Tradeoff) -> list[Table]:
 
 PLOTS = (
     # file, cost, metric, label of the costs, label of the metric
-    ("psnr_over_training", "train_s", "psnr", "training, views included: processor seconds", "PSNR, dB"),
+    ("psnr_over_training", "train_s", "psnr", "processor seconds of training, views included", "PSNR, dB"),
     (
         "lpips_over_training",
         "train_s",
         "lpips_alex",
-        "training, views included: processor seconds",
+        "processor seconds of training, views included",
         "LPIPS×100",
     ),
-    ("psnr_over_animation", "animation_ms", "psnr", "animating a frame: processor milliseconds", "PSNR, dB"),
+    ("psnr_over_animation", "animation_ms", "psnr", "processor milliseconds to animate a frame", "PSNR, dB"),
 )
 FIT_PLOTS = (
     ("fit_pixels", "pixels", "Reprojection error, px"),
@@ -302,7 +302,7 @@ def plots(folder: Path, study: Tradeoff) -> list[Picture]:
             folder / f"{name}.png", shown, study.frontier(cost, metric), across, f"held-out {up}", expected
         )
         dashed = " Dashed: what a preset that was not run would cost, if near." if expected else ""
-        told = f"Held-out {up.partition(',')[0]} against {across.partition(':')[0]}. Numbers are the table's."
+        told = f"Held-out {up.partition(',')[0]} against {across}. Numbers are the table's."
         pictures.append((folder / f"{name}.png", told + dashed))
     file, told = folder / "training_curves.png", (
         "Training curves of every run that learnt from the base's pictures; the frontier's in colour. "
@@ -360,7 +360,7 @@ def headline(study: Tradeoff) -> str:
     levels, base = study.choices[single & study.choices["psnr"].notna()], study.points.loc[1]
     if levels.empty:
         return "The budget reached no setting but the study's own: give it more time."
-    noise = study.noise if math.isfinite(study.noise) else 0.0
+    noise = study.noise if math.isfinite(study.noise) else 0.05  # what would be told as 0.0
     gaining = levels[levels["gain"] > noise]
     if gaining.empty:
         chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"

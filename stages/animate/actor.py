@@ -1,4 +1,4 @@
-"""The avatar as this stage moves it: a pose in, Gaussians out."""
+"""The avatar in a pose, as Gaussians."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _LEGS = ("left_leg", "right_leg")
 
 
 @dataclasses.dataclass(frozen=True)
-class Known:
-    """How far the training frames turn each joint.
+class PoseRange:
+    """The range of poses in the training frames.
 
     Attributes:
         low, high: [324], of ``pose_features``.
@@ -27,14 +27,14 @@ class Known:
     high: Tensor
 
     @classmethod
-    def of(cls, poses: Poses, frames: tuple[int, ...]) -> Known:
+    def of(cls, poses: Poses, frames: tuple[int, ...]) -> PoseRange:
         """The range of some frames of a clip."""
         rows = [row for row, frame in enumerate(poses.frames) if frame in set(frames)]
         features = torch.stack([pose_features(poses.rotation[row]) for row in rows])
         return cls(features.amin(0), features.amax(0))
 
     def nearest(self, pose: Pose) -> Tensor:
-        """What the heads are told of a pose: the nearest that lies in the range, [324]."""
+        """The features of the nearest pose in the range, [324], which the networks are given."""
         return pose_features(pose.rotation).clamp(self.low, self.high)
 
 
@@ -52,7 +52,7 @@ class Actor:
 
     avatar: Avatar
     baked: BakedAvatar | None
-    known: Known | None
+    known: PoseRange | None
     extra: Surface | None
     parts: Tensor
 
@@ -76,7 +76,7 @@ class Actor:
 
 
 @torch.no_grad()
-def make_actor(avatar: Avatar, baking: bool, unseen: str, known: Known | None) -> Actor:
+def make_actor(avatar: Avatar, baking: bool, unseen: str, known: PoseRange | None) -> Actor:
     """An avatar ready to be moved; its ``unseen`` is changed.
 
     Args:

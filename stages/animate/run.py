@@ -1,4 +1,4 @@
-"""The animate stage: reads a motion, gives it to the avatar, films it."""
+"""Running the animate stage: a motion is read, given to the avatar, and drawn_frames."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from pipeline.clip.composite import over, to_bytes
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.records import read_cameras, read_split, write_cameras
 from pipeline.files.json_files import write_json
-from pipeline.motion.motion import Span
-from pipeline.motion.motion_name import TURNTABLE, motion_name
-from pipeline.motion.placement import place
-from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
 from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
 from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, Rendering, render, write_ply
-from stages.animate.actor import Actor, Known, legs_share, make_actor
-from stages.animate.layers import NAMES, layers_of, write_layers
-from stages.animate.script import Script, cameras_of, origin_of, turntable
+from stages.animate.actor import Actor, PoseRange, legs_share, make_actor
+from stages.animate.cameras import Animation, cameras_of, clip_start, turntable
+from stages.animate.exr_layers import NAMES, exr_layers, write_layers
+from stages.animate.motions.motion import Span
+from stages.animate.motions.placement import place
+from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_hands
+from stages.animate.motions.source import TURNTABLE, motion_source
 from stages.animate.settings import AnimateSettings
 
 _HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
@@ -50,81 +50,84 @@ def run(context: Context) -> None:
     body = load_body(context.body_file)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", body)
     legs = legs_share(avatar, body)
-    script = written(context, avatar, body, legs)
+    animation = make_animation(context, avatar, body, legs)
     start = time.monotonic()
-    actor = actor_of(context, avatar, script)
+    actor = ready_actor(context, avatar, animation)
     context.timing("decode_seconds", time.monotonic() - start)
-    cameras = shots(context, script, actor, body)
-    film(context, script, actor, cameras)
+    cameras = frame_cameras(context, animation, actor, body)
+    draw_animation(context, animation, actor, cameras)
     write_cameras(context.output / "cameras.parquet", dict(enumerate(cameras)))
-    write_json(context.output / "animate.json", summary(settings, script, actor, legs))
-    tell(context, script, len(actor))
+    write_json(context.output / "animate.json", summary(settings, animation, actor, legs))
+    log_result(context, animation, len(actor))
 
 
-def written(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> Script:
+def make_animation(context: Context, avatar: Avatar, body: BodyModel, legs: float) -> Animation:
     """Reads the motion and gives it to the person."""
     settings: AnimateSettings = context.settings
-    name, identity = motion_name(settings.motion), avatar.identity
+    name, identity = motion_source(settings.motion), avatar.identity
     if name.kind == TURNTABLE:
         return turntable(body, identity, settings)
     span = Span(settings.first_frame, settings.last_frame, settings.fps)
-    wearer = Wearer(body, context.body_file, identity)
-    motion = read_motion(name, wearer, span, settings.up, context.loans)
+    person = DrivenPerson(body, context.body_file, identity)
+    motion = read_motion(name, person, span, settings.up, context.loans)
     motion = with_relaxed_hands(motion, read_hand_mean(context.body_file))
     placed = place(motion, body, identity, in_place(settings, legs))
-    return Script(placed, motion.numbers, motion.fps, motion=motion)
+    return Animation(placed, motion.numbers, motion.fps, motion=motion)
 
 
 def in_place(settings: AnimateSettings, legs: float) -> bool:
-    """Whether the pelvis stays where it is."""
+    """True if the pelvis stays where it is."""
     return settings.way == "still" or (settings.way == "auto" and legs < _HALF_LEGS)
 
 
-def actor_of(context: Context, avatar: Avatar, script: Script) -> Actor:
+def ready_actor(context: Context, avatar: Avatar, animation: Animation) -> Actor:
     """The avatar, ready to be moved."""
     settings: AnimateSettings = context.settings
-    poses = 1 if script.still else len(script)
+    poses = 1 if animation.still else len(animation)
     baking = settings.bake == "on" or (settings.bake == "auto" and poses >= _WORTH_BAKING)
     known = None
     if settings.heads == "known":
         train = read_split(context.inputs["ingest"] / "split.json").train
-        known = Known.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
+        known = PoseRange.of(read_poses(context.inputs["fit"] / "poses.parquet"), train)
     return make_actor(avatar, baking, settings.unseen, known)
 
 
-def posed(script: Script, actor: Actor, frame: int) -> Gaussians:
-    """The Gaussians of a frame."""
-    return actor.gaussians(script.placed.pose(frame))
-
-
-def shots(context: Context, script: Script, actor: Actor, body: BodyModel) -> list[Camera]:
+def frame_cameras(context: Context, animation: Animation, actor: Actor, body: BodyModel) -> list[Camera]:
     """A camera a frame."""
     ingest, identity = context.inputs["ingest"], actor.avatar.identity
     poses = read_poses(context.inputs["fit"] / "poses.parquet")
-    origin = origin_of(poses, read_cameras(ingest / "cameras.parquet"), body, identity)
-    pelvis = rest_joints(body, identity)[0] + script.placed.transl[0]
-    return cameras_of(script, lambda frame: posed(script, actor, frame), context.settings, origin, pelvis)
+    origin = clip_start(poses, read_cameras(ingest / "cameras.parquet"), body, identity)
+    pelvis = rest_joints(body, identity)[0] + animation.placed.transl[0]
+    return cameras_of(
+        animation,
+        lambda frame: actor.gaussians(animation.placed.pose(frame)),
+        context.settings,
+        origin,
+        pelvis,
+    )
 
 
-def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) -> None:
+def draw_animation(context: Context, animation: Animation, actor: Actor, cameras: list[Camera]) -> None:
     """Draws every frame once and writes what is asked for."""
     settings: AnimateSettings = context.settings
     for kind in ("exr", "ply"):
         if kind in settings.outputs:
             (context.output / kind).mkdir()
+    wanted = settings.sheet_frames
+    on_sheet = {0} if wanted == 1 else set(spread_end_to_end(range(len(animation)), wanted))
     kept: dict[str, np.ndarray] = {}
     spent: dict[str, list[float]] = defaultdict(list)
-    with context.progress(len(script), "drawing") as progress:
+    with context.progress(len(animation), "drawing") as progress:
 
         def pictures() -> Iterator[np.ndarray]:
-            for frame, picture in drawn(context, script, actor, cameras, spent):
-                if frame in sheet_rows(len(script), settings.sheet_frames):
-                    kept[f"{script.numbers[frame]}  {frame / script.fps:.2f} s"] = picture
+            for frame, picture in drawn_frames(context, animation, actor, cameras, spent):
+                if frame in on_sheet:
+                    kept[f"{animation.numbers[frame]}  {frame / animation.fps:.2f} s"] = picture
                 yield picture
                 progress.advance()
 
         if "video" in settings.outputs:
-            write_video(context.output / "animation.mp4", pictures(), script.fps)
+            write_video(context.output / "animation.mp4", pictures(), animation.fps)
         else:
             for _ in pictures():
                 pass
@@ -135,10 +138,10 @@ def film(context: Context, script: Script, actor: Actor, cameras: list[Camera]) 
     context.timing("milliseconds_a_frame", each)
 
 
-def drawn(
-    context: Context, script: Script, actor: Actor, cameras: list[Camera], spent: dict[str, list[float]]
+def drawn_frames(
+    context: Context, animation: Animation, actor: Actor, cameras: list[Camera], spent: dict[str, list[float]]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Every frame with its picture; splats and layers are written on the way, if they are asked for.
+    """Every frame with its picture; splats and layers are make_animation on the way, if they are asked for.
 
     Args:
         spent: filled with the seconds that each frame took, by what.
@@ -146,22 +149,22 @@ def drawn(
     settings: AnimateSettings = context.settings
     gaussians: Gaussians | None = None
     for frame, camera in enumerate(cameras):
-        clock = _Clock(spent)
-        fresh = gaussians is None or not script.still
+        timer = _Timer(spent)
+        fresh = gaussians is None or not animation.still
         if gaussians is None or fresh:
-            gaussians = posed(script, actor, frame)
-        clock.note("pose")
+            gaussians = actor.gaussians(animation.placed.pose(frame))
+        timer.note("pose")
         with torch.no_grad():
             rendering = render(gaussians, camera)
-        clock.note("render")
+        timer.note("render")
         if "ply" in settings.outputs and fresh:
             write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians)
-            clock.note("ply")
+            timer.note("ply")
         if "exr" in settings.outputs:
-            layers = layers_of(gaussians, actor.parts, camera, rendering)
-            clock.note("layers")
+            layers = exr_layers(gaussians, actor.parts, camera, rendering)
+            timer.note("layers")
             write_layers(context.output / "exr" / f"{frame:06d}.exr", layers)
-            clock.note("exr")
+            timer.note("exr")
         yield frame, on_background(rendering, settings.color)
 
 
@@ -170,7 +173,7 @@ def on_background(rendering: Rendering, color: tuple[float, float, float]) -> np
     return to_bytes(over(rendering.color, rendering.alpha, torch.tensor(color)))
 
 
-class _Clock:
+class _Timer:
     """Seconds since the last look, by what they were spent on."""
 
     def __init__(self, spent: dict[str, list[float]]) -> None:
@@ -182,19 +185,14 @@ class _Clock:
         self.last = now
 
 
-def sheet_rows(count: int, wanted: int) -> set[int]:
-    """The frames on the contact sheet, evenly spaced, first and last included."""
-    return {0} if wanted == 1 else set(spread_end_to_end(range(count), wanted))
-
-
-def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float) -> dict[str, Any]:
-    """What ``animate.json`` holds. What differs between equal runs, the times, is in ``run.json``."""
-    motion = script.motion
+def summary(settings: AnimateSettings, animation: Animation, actor: Actor, legs: float) -> dict[str, Any]:
+    """The content of ``animate.json``. Times, which differ between equal runs, are in ``run.json``."""
+    motion = animation.motion
     found: dict[str, Any] = {
         "motion": motion.name if motion else TURNTABLE,
-        "frames": len(script),
-        "fps": script.fps,
-        "source_frames": list(script.numbers),
+        "frames": len(animation),
+        "fps": animation.fps,
+        "source_frames": list(animation.numbers),
         "gaussians": len(actor),
         "baked": actor.baked is not None,
         "background": settings.background,
@@ -204,7 +202,7 @@ def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float
     if motion is not None:
         still = in_place(settings, legs)
         found |= {
-            "scale": round(script.placed.scale, 6),
+            "scale": round(animation.placed.scale, 6),
             "way": {"kept": not still, "share_of_legs": round(legs, 4), "threshold": _HALF_LEGS},
             "joints_not_told": [name for name in JOINT_NAMES if name not in motion.told],
             "joints_not_used": list(motion.unused),
@@ -215,9 +213,9 @@ def summary(settings: AnimateSettings, script: Script, actor: Actor, legs: float
     return found
 
 
-def tell(context: Context, script: Script, gaussians: int) -> None:
+def log_result(context: Context, animation: Animation, gaussians: int) -> None:
     """Says in a few lines what was made and what a user should know of it."""
-    motion = script.motion
+    motion = animation.motion
     for note in motion.notes if motion else ():
         context.log(note)
     if motion and motion.unused:
@@ -229,5 +227,5 @@ def tell(context: Context, script: Script, gaussians: int) -> None:
         f"{name} {value:.1f}" for name, value in context.timings.get("milliseconds_a_frame", {}).items()
     )
     context.log(
-        f"{len(script)} frames at {script.fps:.4g} a second, {gaussians} Gaussians; ms a frame: {times}"
+        f"{len(animation)} frames at {animation.fps:.4g} a second, {gaussians} Gaussians; ms a frame: {times}"
     )

@@ -1,4 +1,4 @@
-"""What the animate stage can be told."""
+"""Settings of the animate stage."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
-from pipeline.motion.motion_name import TURNTABLE, motion_name
+from stages.animate.motions.source import TURNTABLE, motion_source
 
 ColorName = Literal["grey", "black", "white", "green"]
 NAMED_COLORS: Mapping[ColorName, str] = {
@@ -83,7 +83,7 @@ class AnimateSettings:
             span = f"{self.first_frame} to {self.last_frame}"
             raise ValueError(f"animate.first_frame and animate.last_frame: {span} is no range")
         try:
-            motion_name(self.motion)
+            motion_source(self.motion)
         except UserError as error:
             raise ValueError(str(error)) from None
         return self

@@ -1,4 +1,4 @@
-"""Views the camera never saw: guidance for a generator, and what of its frames is fit to learn from."""
+"""auxiliary: views the camera never saw, from a generator, checked before they are learnt from."""
 
 from pipeline.run.stage import Stage
 from stages.auxiliary.settings import AuxiliarySettings

@@ -1,4 +1,4 @@
-"""Full body in, the clip's own framing out (supplement B), and which pixels teach anything new."""
+"""Cropping a full-body picture to the clip's framing (supplement B), with a map of what is new in it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.body.rasterize import Raster
 from pipeline.clip.boxes import Box
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
-from stages.auxiliary.texture import FineSurface
+from pipeline.texture import FineSurface
 
 SHOWN = 0.5  # share of the training frames that must have a vertex within their borders
 LOOKED_AT = 24  # training frames that are asked
@@ -25,7 +25,7 @@ DOUBT = 0.03  # of the body's height: beside it hair and clothes may be, or not
 
 @dataclasses.dataclass(frozen=True)
 class Framing:
-    """What of the body the clip frames, and how large.
+    """The part of the body that the clip frames, and its size there.
 
     Attributes:
         shown: [V] float32, 1 for vertices that lie within the picture's borders in half of the frames or
@@ -85,11 +85,8 @@ def crop(
 
     Args:
         image, mask: the picture and its person.
-        camera: of the picture.
         vertices: the registered body's.
-        surface: the fine mesh.
         carried: of its vertices: 1 where the clip shows nothing, and 1 where the clip frames it.
-        framing: of the clip.
 
     Returns:
         None where the picture shows nothing of what the clip frames.
@@ -117,6 +114,12 @@ def crop(
         parts = [cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts]
     image, cut, trust = (np.ascontiguousarray(part) for part in parts)
     return Cropped(image, cut, trust, view.resized(*size), news)
+
+
+def pixel_map(source: Camera, target: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Scale and shift, [2] each, from the pixels of a camera to those of one with other intrinsics."""
+    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
+    return scale, target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
 
 
 def _box(camera: Camera, points: Tensor) -> Box | None:

@@ -27,10 +27,10 @@ from pipeline.clip.frames import spread_from_start
 from pipeline.clip.keypoints import COUNT
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_initial_poses, tool_joints
+from pipeline.pose_files import into_world, moved_pivot, read_hand_mean, read_smplx_json, tool_joints
 from pipeline.untrusted import parse_json
-from stages.auxiliary.offer import Offer, Picture
-from stages.auxiliary.turn import ID_OFFSET, Turn
+from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
+from stages.auxiliary.turntable_motion import ID_OFFSET, TurntableMotion
 
 PICTURES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d+)")
@@ -38,8 +38,8 @@ _REMEDY = "see docs/auxiliary.md for the layouts that auxiliary.folder may have"
 _LARGEST = 1e6
 
 
-def read_folder(path: Path, clip: FittedClip, turn: Turn, body_file: Path) -> Offer:
-    """What lies at ``path``, whichever layout it has.
+def read_folder(path: Path, clip: FittedClip, turn: TurntableMotion, body_file: Path) -> GeneratorOutput:
+    """The frames at ``path``, in any of the layouts.
 
     Raises:
         UserError: there is nothing there, or it cannot be read.
@@ -54,7 +54,7 @@ def read_folder(path: Path, clip: FittedClip, turn: Turn, body_file: Path) -> Of
     if (path / "poses.parquet").is_file():
         return _ours(path, frames)
     files = list(numbered(frames).values())
-    return Offer(turn.poses, _cameras(turn), _spread(files, turn))
+    return GeneratorOutput(turn.poses, _cameras(turn), _spread(files, turn))
 
 
 def numbered(folder: Path) -> dict[int, Path]:
@@ -69,7 +69,7 @@ def numbered(folder: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _ours(path: Path, frames: Path) -> Offer:
+def _ours(path: Path, frames: Path) -> GeneratorOutput:
     # Whatever their poses came from, the pictures were made from them.
     files, poses = numbered(frames), dataclasses.replace(read_poses(path / "poses.parquet"), valid=None)
     cameras = read_cameras(path / "cameras.parquet")
@@ -78,15 +78,15 @@ def _ours(path: Path, frames: Path) -> Offer:
     if not usable:
         raise UserError(f"{path}: no frame has a picture, a pose and a camera: {_REMEDY}")
 
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Iterator[GeneratedPicture]:
         for frame in usable:
             mask = read_grey(masks[frame]) if frame in masks else None
-            yield Picture(frame, read_color(files[frame]), mask)
+            yield GeneratedPicture(frame, read_color(files[frame]), mask)
 
-    return Offer(poses, cameras, pictures())
+    return GeneratorOutput(poses, cameras, pictures())
 
 
-def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Offer:
+def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> GeneratorOutput:
     """The peers' ``_gen`` folder; frames are those with a picture, a pose and a camera, and on the list."""
     files = numbered(frames)
     files = {frame % ID_OFFSET: file for frame, file in files.items()}
@@ -97,7 +97,7 @@ def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Offer
     usable = sorted({*files} & {*cameras} & {*ids} & (listed if listed is not None else {*files}))
     if not usable:
         raise UserError(f"{path}: no frame has a picture, a pose and a camera: {_REMEDY}")
-    read = read_initial_poses(parameters, [ids[frame] for frame in usable], read_hand_mean(body_file))
+    read = read_smplx_json(parameters, [ids[frame] for frame in usable], read_hand_mean(body_file))
     if read.transl is None:
         raise UserError(f"{parameters}: its files have no 'trans': {_REMEDY}")
     sizes = {frame: read_color(files[frame]).shape for frame in usable}
@@ -115,10 +115,10 @@ def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Offer
         shared = min(width, read.expression.shape[1])
         expression[:, :shared] = read.expression[:, :shared]
     poses = Poses(tuple(usable), turned, expression, moved_pivot(orient, transl, theirs, ours).float())
-    return Offer(poses, views, _peer_pictures(path, files, usable))
+    return GeneratorOutput(poses, views, _peer_pictures(path, files, usable))
 
 
-def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Iterator[Picture]:
+def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Iterator[GeneratedPicture]:
     folders = {name: path / name for name in ("masks", "keypoints_whole_body")}
     masks, points = (
         {number % ID_OFFSET: file for number, file in _by_number(folder).items()}
@@ -127,7 +127,7 @@ def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Ite
     for frame in usable:
         mask = read_grey(masks[frame]) if frame in masks else None
         keypoints = _whole_body(points[frame]) if frame in points else None
-        yield Picture(frame, read_color(files[frame]), mask, keypoints)
+        yield GeneratedPicture(frame, read_color(files[frame]), mask, keypoints)
 
 
 def _peer_camera(path: Path, size: tuple[int, ...]) -> Camera:
@@ -146,7 +146,7 @@ def _peer_camera(path: Path, size: tuple[int, ...]) -> Camera:
     return Camera(size[1], size[0], intrinsics, turned, torch.from_numpy(translation).float())
 
 
-def _video(path: Path, turn: Turn) -> Offer:
+def _video(path: Path, turn: TurntableMotion) -> GeneratorOutput:
     import av
 
     try:
@@ -156,25 +156,25 @@ def _video(path: Path, turn: Turn) -> Offer:
         raise UserError(f"{path} cannot be read as a video ({error}): {_REMEDY}") from None
     if not images:
         raise UserError(f"{path} holds no frame: {_REMEDY}")
-    return Offer(turn.poses, _cameras(turn), _fitted(images, turn))
+    return GeneratorOutput(turn.poses, _cameras(turn), _fitted(images, turn))
 
 
-def _spread(files: list[Path], turn: Turn) -> Iterator[Picture]:
+def _spread(files: list[Path], turn: TurntableMotion) -> Iterator[GeneratedPicture]:
     for place, frame in _places(len(files), turn):
-        yield Picture(frame, to_size(read_color(files[place]), turn.camera))
+        yield GeneratedPicture(frame, to_size(read_color(files[place]), turn.camera))
 
 
-def _fitted(images: list[np.ndarray], turn: Turn) -> Iterator[Picture]:
+def _fitted(images: list[np.ndarray], turn: TurntableMotion) -> Iterator[GeneratedPicture]:
     for place, frame in _places(len(images), turn):
-        yield Picture(frame, to_size(images[place], turn.camera))
+        yield GeneratedPicture(frame, to_size(images[place], turn.camera))
 
 
-def _places(count: int, turn: Turn) -> list[tuple[int, int]]:
-    """Which picture shows which frame of the turn: all of it, or evenly spread."""
+def _places(count: int, turn: TurntableMotion) -> list[tuple[int, int]]:
+    """Pairs (picture, frame of the turn that it shows): all of the turn, or evenly spread."""
     return list(enumerate(spread_from_start(turn.poses.frames, count)))
 
 
-def _cameras(turn: Turn) -> dict[int, Camera]:
+def _cameras(turn: TurntableMotion) -> dict[int, Camera]:
     return dict.fromkeys(turn.poses.frames, turn.camera)
 
 

@@ -1,4 +1,4 @@
-"""The folder that a pose-to-video model is given; docs/auxiliary.md says how.
+"""Writing the folder that a pose-to-video model is given, see docs/auxiliary.md.
 
 ::
 
@@ -27,7 +27,7 @@ from pipeline.files.json_files import write_json
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from stages.auxiliary.reference import Reference
 from stages.auxiliary.skeleton import draw_skeleton
-from stages.auxiliary.turn import Turn
+from stages.auxiliary.turntable_motion import TurntableMotion
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -36,16 +36,12 @@ FOLDER = "guidance"
 
 
 def write_guidance(
-    context: Context, clip: FittedClip, turn: Turn, keypoints: np.ndarray, reference: Reference
+    context: Context, clip: FittedClip, turn: TurntableMotion, keypoints: np.ndarray, reference: Reference
 ) -> None:
     """Write everything that the module's docstring lists.
 
     Args:
-        context: the stage's.
-        clip: the person.
-        turn: the driving motion.
         keypoints: [T, 133, 3], the turn's skeletons.
-        reference: the picture of the person.
     """
     folder, settings = context.output / FOLDER, context.settings
     (folder / "poses").mkdir(parents=True)
@@ -76,7 +72,7 @@ def write_guidance(
 
 
 def _write_records(
-    folder: Path, clip: FittedClip, turn: Turn, keypoints: np.ndarray, body_file: Path
+    folder: Path, clip: FittedClip, turn: TurntableMotion, keypoints: np.ndarray, body_file: Path
 ) -> None:
     cameras = dict.fromkeys(turn.poses.frames, turn.camera)
     write_poses(folder / "poses.parquet", turn.poses)

@@ -1,4 +1,4 @@
-"""What training reads: cropped frames with masks, trust, cameras and poses of their own, and the counts."""
+"""Publishing the frames for training: cropped, with masks, trust, cameras, poses, and the counts."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras
 from pipeline.files.json_files import write_json
 from pipeline.pictures import side_by_side
-from stages.auxiliary.accept import Accepted
-from stages.auxiliary.crop import Framing, crop
-from stages.auxiliary.texture import FineSurface
-from stages.auxiliary.turn import ID_OFFSET
+from pipeline.texture import FineSurface
+from stages.auxiliary.crop import Framing, crop, pixel_map
+from stages.auxiliary.filter_frames import FilteredFrames
+from stages.auxiliary.turntable_motion import ID_OFFSET
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -35,7 +35,7 @@ _SHEET, _TILE = 8, 256  # frames of the contact sheet, and pixels of their heigh
 def publish(
     context: Context,
     clip: FittedClip,
-    accepted: Accepted,
+    accepted: FilteredFrames,
     framing: Framing,
     surface: FineSurface,
     known: np.ndarray,  # [N]
@@ -43,11 +43,6 @@ def publish(
     """Crop the accepted frames to the clip's framing and write them.
 
     Args:
-        context: the stage's.
-        clip: the person.
-        accepted: the frames.
-        framing: what the clip frames.
-        surface: the fine mesh.
         known: of its vertices, whether the clip shows it.
     """
     settings, output = context.settings, context.output
@@ -84,7 +79,7 @@ def publish(
 
 
 def write_records(
-    context: Context, accepted: Accepted, cameras: dict[int, Camera], refused: dict[str, int]
+    context: Context, accepted: FilteredFrames, cameras: dict[int, Camera], refused: dict[str, int]
 ) -> None:
     """Write cameras, poses, keypoints and ``auxiliary.json`` of the frames that have a camera."""
     output, frames = context.output, sorted(cameras)
@@ -117,8 +112,7 @@ def write_records(
 
 def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:
     """Keypoints [133, 3] of a picture in a crop of it, those outside with score 0."""
-    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
-    shift = target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
+    scale, shift = pixel_map(source, target)
     placed = points.copy()
     placed[:, :2] = points[:, :2] * scale + shift
     inside = (placed[:, :2] >= 0).all(1) & (placed[:, 0] < target.width) & (placed[:, 1] < target.height)

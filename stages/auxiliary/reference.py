@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.body import Landmarks, joint_index, joint_orientations, locate, pose_frame
+from pipeline.body import Landmarks, locate, pose_frame
 from pipeline.clip.camera import Camera, project
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from stages.auxiliary.crop import Framing
-from stages.auxiliary.skeleton import driven_keypoints
-from stages.auxiliary.texture import FineSurface, paint
-from stages.auxiliary.turn import Turn
+from pipeline.texture import FineSurface, paint
+from stages.auxiliary.crop import Framing, pixel_map
+from stages.auxiliary.skeleton import driven_keypoints, head_facing
+from stages.auxiliary.turntable_motion import TurntableMotion
 
 LOOKED_AT = 60  # frames that are scored
 WEIGHTS = {"facing": 2.0, "sharpness": 1.0, "face": 1.0, "hands": 0.5, "mask": 1.0}
@@ -31,7 +31,7 @@ _FEATHER = 0.01  # of the picture's height, over which the clip's picture runs i
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Why a frame was chosen; every part lies in [0, 1].
+    """The reasons for which a frame is chosen; every part lies in [0, 1].
 
     Attributes:
         frame: its number.
@@ -60,7 +60,10 @@ def score_frames(clip: FittedClip) -> list[Score]:
     for frame in clip.spread(LOOKED_AT):
         image, mask = clip.frame(frame), clip.mask(frame)
         points = clip.keypoints.whole_body[clip.keypoints.index(frame)]
-        looks.append((frame, facing(clip, frame), sharpness(image, mask), points, surety(mask)))
+        facing = max(
+            0.0, head_facing(clip, clip.pose(frame), clip.camera(frame), clip.vertices(frame).mean(0))
+        )
+        looks.append((frame, facing, sharpness(image, mask), points, mask_confidence(mask)))
     sharpest = max(max(look[2] for look in looks), 1e-9)
     scores = [
         Score(
@@ -76,13 +79,6 @@ def score_frames(clip: FittedClip) -> list[Score]:
     return sorted(scores, key=lambda score: (-score.total, score.frame))
 
 
-def facing(clip: FittedClip, frame: int) -> float:
-    """How far the head looks at the camera, 0 (sideways or away) to 1."""
-    front = joint_orientations(clip.pose(frame).rotation, clip.body.parents)[joint_index("head")][:, 2]
-    view = clip.camera(frame).centre - clip.vertices(frame).mean(0)
-    return max(0.0, float(front @ view / view.norm()))
-
-
 def sharpness(image: np.ndarray, mask: np.ndarray) -> float:
     """The mean squared Laplacian of the person's inside, 0 where there is none."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -90,7 +86,7 @@ def sharpness(image: np.ndarray, mask: np.ndarray) -> float:
     return float(np.square(cv2.Laplacian(grey, cv2.CV_32F))[inside].mean()) if inside.any() else 0.0
 
 
-def surety(mask: np.ndarray) -> float:
+def mask_confidence(mask: np.ndarray) -> float:
     """The share of a mask's pixels that are wholly the person's."""
     touched = mask > 8
     return float((mask[touched] > 247).mean()) if touched.any() else 0.0
@@ -98,7 +94,7 @@ def surety(mask: np.ndarray) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The reference picture.
+    """The picture of the person that a generator is given.
 
     Attributes:
         image: [H, W, 3] uint8 RGB, of the turn's camera's size.
@@ -115,7 +111,7 @@ class Reference:
 
 def make_reference(
     clip: FittedClip,
-    turn: Turn,
+    turn: TurntableMotion,
     landmarks: Landmarks,
     framing: Framing,
     surface: FineSurface,
@@ -144,7 +140,9 @@ def make_reference(
     return Reference(np.clip(np.round(picture), 0, 255).astype(np.uint8), keypoints, score, not whole)
 
 
-def moved_camera(clip: FittedClip, turn: Turn, landmarks: Landmarks, frame, joints, vertices) -> Camera:
+def moved_camera(
+    clip: FittedClip, turn: TurntableMotion, landmarks: Landmarks, frame, joints, vertices
+) -> Camera:
     """The clip's camera with its picture moved and scaled onto the turn's first skeleton."""
     camera = clip.cameras[frame]
     there = pose_frame(clip.body, clip.identity, turn.poses.pose(0))
@@ -167,8 +165,7 @@ def moved_camera(clip: FittedClip, turn: Turn, landmarks: Landmarks, frame, join
 
 def _change(source: Camera, target: Camera) -> np.ndarray:
     """The affine map of pixels between two cameras that differ in their intrinsics: [2, 3]."""
-    scale = (target.intrinsics.diagonal()[:2] / source.intrinsics.diagonal()[:2]).numpy()
-    shift = target.intrinsics[:2, 2].numpy() - scale * source.intrinsics[:2, 2].numpy()
+    scale, shift = pixel_map(source, target)
     # OpenCV puts the first pixel's centre at 0, we at 0.5.
     shift = shift + 0.5 * scale - 0.5
     return np.array([[scale[0], 0, shift[0]], [0, scale[1], shift[1]]], np.float64)

@@ -47,10 +47,7 @@ def register(
     """The poses, moved to the found keypoints.
 
     Args:
-        clip: the body and its identity.
-        landmarks: where the points are on it.
         poses: the T driving poses.
-        cameras: of each.
         found: pixels and scores, in the order of ``POINTS``.
     """
     points = landmarks.whole_body[POINTS]
@@ -103,7 +100,7 @@ def register(
 
 
 def _heights(found: np.ndarray) -> Tensor:
-    """How tall the trusted points stand in each frame, pixels, at least 1: [T]."""
+    """The height of the trusted points in each frame, pixels, at least 1: [T]."""
     tall = []
     for points in found:
         rows = points[points[:, 2] >= TRUSTED, 1]

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from pipeline.body import load_landmarks, posed_vertices
+from pipeline.body import load_landmarks
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.plan import read_plan
 from pipeline.errors import UserError
-from stages.auxiliary import texture
-from stages.auxiliary.accept import accept_checked, accept_exact
+from pipeline.texture import fine_surface, gather_colors
 from stages.auxiliary.crop import find_framing
+from stages.auxiliary.filter_frames import filter_frames, take_all
 from stages.auxiliary.folder import read_folder
+from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
 from stages.auxiliary.guidance import write_guidance
-from stages.auxiliary.offer import Offer, Picture
 from stages.auxiliary.publish import publish
 from stages.auxiliary.reference import make_reference
-from stages.auxiliary.skeleton import turn_keypoints
-from stages.auxiliary.turn import Turn, make_turn, read_numbered_clip
+from stages.auxiliary.skeleton import turntable_keypoints
+from stages.auxiliary.texture_generator import complete, painted
+from stages.auxiliary.turntable_motion import TurntableMotion, make_turntable_motion, read_numbered_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -45,28 +43,29 @@ def run(context: Context) -> None:
     shutil.rmtree(context.work / "made", ignore_errors=True)
     clip = read_numbered_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
     landmarks, settings = load_landmarks(clip.body, context.body), context.settings
-    turn, surface = make_turn(clip, settings), texture.fine_surface(clip.body, settings.texture_levels)
+    turn, surface = (
+        make_turntable_motion(clip, settings),
+        fine_surface(clip.body, settings.texture_levels),
+    )
     frames = clip.spread(settings.texture_frames)
     with context.progress(len(frames), "texture") as progress:
-        seen = texture.gather_colors(surface, clip, frames, progress.advance)
-    colors, framing = texture.complete(surface, seen, settings.texture_light), find_framing(clip)
+        seen = gather_colors(surface, clip, frames, progress.advance)
+    colors, framing = complete(surface, seen, settings.texture_light), find_framing(clip)
     context.log(f"the clip shows {seen.known.mean():.0%} of the surface")
     if generator != "texture" or settings.texture_guidance:
         reference = make_reference(clip, turn, landmarks, framing, surface, colors)
-        keypoints = turn_keypoints(clip, turn, landmarks)
+        keypoints = turntable_keypoints(clip, turn, landmarks)
         write_guidance(context, clip, turn, keypoints, reference)
     if generator == "guidance":
         return
     if generator == "texture":
-        accepted = accept_exact(
-            context, clip, landmarks, painted(clip, turn, surface, colors), len(turn.poses)
-        )
+        accepted = take_all(context, clip, landmarks, painted(clip, turn, surface, colors), len(turn.poses))
     else:
-        offer = offered(context, generator, clip, turn)
+        output = generated(context, generator, clip, turn)
         if settings.check:
-            accepted = accept_checked(context, clip, landmarks, offer)
+            accepted = filter_frames(context, clip, landmarks, output)
         else:
-            accepted = accept_exact(context, clip, landmarks, offer, len(offer.poses))
+            accepted = take_all(context, clip, landmarks, output, len(output.poses))
     publish(context, clip, accepted, framing, surface, seen.known)
 
 
@@ -81,19 +80,7 @@ def chosen_generator(context: Context) -> str:
     return "texture" if called_for else "off"
 
 
-def painted(clip: FittedClip, turn: Turn, surface: texture.FineSurface, colors: np.ndarray) -> Offer:
-    """The ``texture`` generator: the textured body through the turn."""
-
-    def pictures() -> Iterator[Picture]:
-        for frame in turn.poses.frames:
-            vertices = posed_vertices(clip.body, clip.identity, turn.poses.pose(frame))
-            image, mask, _ = texture.paint(turn.camera, surface, vertices, colors)
-            yield Picture(frame, image, mask)
-
-    return Offer(turn.poses, dict.fromkeys(turn.poses.frames, turn.camera), pictures(), exact=True)
-
-
-def offered(context: Context, generator: str, clip: FittedClip, turn: Turn) -> Offer:
+def generated(context: Context, generator: str, clip: FittedClip, turn: TurntableMotion) -> GeneratorOutput:
     """The frames of ``folder`` or ``mimicmotion``."""
     settings = context.settings
     if generator == "folder":
@@ -106,5 +93,7 @@ def offered(context: Context, generator: str, clip: FittedClip, turn: Turn) -> O
         ) from None
     images = animate(context, context.output / "guidance")
     cameras = dict.fromkeys(turn.poses.frames, turn.camera)
-    pictures = (Picture(frame, image) for frame, image in zip(turn.poses.frames, images, strict=True))
-    return Offer(turn.poses, cameras, pictures)
+    pictures = (
+        GeneratedPicture(frame, image) for frame, image in zip(turn.poses.frames, images, strict=True)
+    )
+    return GeneratorOutput(turn.poses, cameras, pictures)

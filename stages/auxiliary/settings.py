@@ -1,4 +1,4 @@
-"""What can be set about auxiliary views. The defaults are the ``quick`` preset's values."""
+"""Settings of the auxiliary views. The defaults are the ``quick`` preset's values."""
 
 from __future__ import annotations
 
@@ -83,5 +83,5 @@ class AuxiliarySettings:
 
     @property
     def assets(self) -> tuple[str, ...]:
-        """What has to be on disk: the detector and the identity network, where frames are looked at."""
+        """The assets that are needed: the detector and the identity network, where frames are checked."""
         return ("mediapipe", "dlib", "identity") if self.generator in MEASURED and self.check else ()

@@ -13,11 +13,19 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from pipeline.body import Landmarks, locate, pose_frame, rasterize
+from pipeline.body import (
+    Landmarks,
+    Pose,
+    joint_index,
+    joint_orientations,
+    locate,
+    pose_frame,
+    rasterize,
+)
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.fitted_clip import FittedClip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
-from stages.auxiliary.turn import Turn
+from stages.auxiliary.turntable_motion import TurntableMotion
 
 LEAST = 0.3  # the score under which a point is not drawn
 DIMMED = 0.6  # of the body layer's limbs
@@ -119,11 +127,8 @@ def driven_keypoints(
     A point of the face that is turned away scores 0, a joint behind the body ``OCCLUDED``, the rest 1.
 
     Args:
-        clip: the body.
-        landmarks: where the points are on it.
         joints: [55, 3], posed, metres.
         vertices: [V, 3], posed.
-        camera: the view.
     """
     places = locate(landmarks.whole_body, joints, vertices)
     pixels = project(camera, places).numpy()
@@ -139,10 +144,22 @@ def driven_keypoints(
     return np.concatenate([pixels, (scores * inside)[:, None]], axis=1).astype(np.float32)
 
 
-def turn_keypoints(clip: FittedClip, turn: Turn, landmarks: Landmarks) -> np.ndarray:
+def turntable_keypoints(clip: FittedClip, turn: TurntableMotion, landmarks: Landmarks) -> np.ndarray:
     """The driving skeletons of a whole turn: [T, 133, 3] float32."""
     found = []
     for frame in turn.poses.frames:
         vertices, joints = pose_frame(clip.body, clip.identity, turn.poses.pose(frame))
         found.append(driven_keypoints(clip, landmarks, joints, vertices, turn.camera))
     return np.stack(found)
+
+
+def head_facing(clip: FittedClip, pose: Pose, camera: Camera, place: Tensor) -> float:
+    """The cosine between the head's front and the way to the camera.
+
+    Args:
+        pose: of the body.
+        place: [3], where the body is.
+    """
+    front = joint_orientations(pose.rotation, clip.body.parents)[joint_index("head")][:, 2]
+    view = camera.centre - place
+    return float(front @ view / view.norm())

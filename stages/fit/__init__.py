@@ -5,7 +5,7 @@ from stages.fit.settings import FitSettings
 
 STAGE = Stage(
     name="fit",
-    version=6,
+    version=7,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={

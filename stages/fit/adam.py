@@ -14,16 +14,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
 from pipeline.clip.curves import Curve
+from pipeline.finite import NotFiniteError, finite, rows_not_finite
 from pipeline.numba_kernels import threads
-from stages.fit.finite import finite_loss, require_finite_gradient
-from stages.fit.objective import Objective
+from stages.fit.objective import RegistrationObjective
 from stages.fit.parameters import PER_FRAME, Parameters
 from stages.fit.windows import Window, bumps, windows
 
@@ -36,27 +37,29 @@ RATES = {
 ROOT_UNTIL, OFFSETS_FROM, ROBUST_FROM = 0.15, 0.4, 0.3
 WARM_UP = 10  # iterations over which the steps grow to their full length
 _POINTS = 16  # of the curve
+REMEDY = "look at the keypoints and cameras, or try a smaller fit.learning_rate; nothing is published"
+_NAMED = 5  # frames that a message names
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
 """From which share of the iterations on steps have which width in time: standard deviation in frames."""
 
 
-Watch = Callable[[int, float, Callable[[], Parameters]], None]
+StepCallback = Callable[[int, float, Callable[[], Parameters]], None]
 """Called with the number of steps done, the loss before the last, and what gives the parameters."""
 
 
 def ignore(step: int, loss: float, now: Callable[[], Parameters]) -> None:
-    """A watch that does nothing."""
+    """A ``StepCallback`` that does nothing."""
 
 
 class Recorder:
-    """A watch that notes the loss after every step and keeps the curve of the fit.
+    """A ``StepCallback`` that notes the loss after every step and keeps the curve of the fit.
 
     Attributes:
         curve: ``loss`` and ``pixels``, the mean reprojection error of all trusted points, at a few steps.
         seconds: (step, seconds since the start) of the same points, without the time they took themselves.
     """
 
-    def __init__(self, objective: Objective, steps: int, report: Callable[[str], None]) -> None:
+    def __init__(self, objective: RegistrationObjective, steps: int, report: Callable[[str], None]) -> None:
         """Watch ``steps`` steps; ``report`` is called after each with a note on the loss."""
         self.curve, self.seconds = Curve(), [(0, 0.0)]
         self._objective, self._report = objective, report
@@ -69,7 +72,7 @@ class Recorder:
         self._idle, self._start = 0.0, time.monotonic()
 
     def __call__(self, step: int, loss: float, now: Callable[[], Parameters]) -> None:
-        """Note a step, as a ``Watch`` does."""
+        """Note a step, as a ``StepCallback`` does."""
         if step in self._points:
             self.seconds.append((step, time.monotonic() - self._start - self._idle))
             self._point(step, {"loss": loss}, now())
@@ -126,7 +129,7 @@ def stepped(
 
 
 def gradients(
-    objective: Objective,
+    objective: RegistrationObjective,
     base: Parameters,
     steps: Parameters,
     width: float,
@@ -154,24 +157,21 @@ def gradients(
 
 
 def optimise(
-    objective: Objective,
+    objective: RegistrationObjective,
     initial: Parameters,
     iterations: int,
     frozen: frozenset[str] = frozenset(),
     learning_rate: float = 1.0,
     minibatch: int = 256,
-    watch: Watch = ignore,
+    on_step: StepCallback = ignore,
 ) -> Parameters:
     """Fit a clip.
 
     Args:
-        objective: its loss.
-        initial: where to start.
-        iterations: steps.
         frozen: names of groups of parameters that stay as they are.
         learning_rate: factor on every step.
         minibatch: frames that are posed at a time, which bounds the memory and changes nothing else.
-        watch: called after each step.
+        on_step: called after each step.
 
     Raises:
         NotFiniteError: the loss or its gradient is not finite.
@@ -193,7 +193,7 @@ def optimise(
                 loss = gradients(objective, base, steps, width, minibatch, robust, step)
                 adam.step()
                 now = functools.partial(_moved, base, steps, objective.times, width, minibatch)
-                watch(step + 1, loss, now)
+                on_step(step + 1, loss, now)
             base = _moved(base, steps, objective.times, width, minibatch)
             for leaf in steps.named().values():
                 leaf.zero_()
@@ -215,3 +215,71 @@ def _phases(iterations: int) -> list[tuple[int, int, float]]:
     starts = [round(share * iterations) for share, _ in BUMPS] + [iterations]
     phases = [(starts[k], starts[k + 1], width) for k, (_, width) in enumerate(BUMPS)]
     return [phase for phase in phases if phase[0] < phase[1]]
+
+
+def finite_sum(losses: Mapping[str, Tensor], step: int, frames: str = "") -> Tensor:
+    """The sum of the terms.
+
+    Args:
+        losses: by name.
+        step: of the optimisation, for the message.
+        frames: which frames they are of.
+
+    Raises:
+        NotFiniteError: it is not finite; the message names the terms.
+    """
+    total = torch.stack(list(losses.values())).sum()
+    if not math.isfinite(float(total.detach())):
+        bad = ", ".join(name for name, loss in losses.items() if not torch.isfinite(loss)) or "their sum"
+        what = f"its loss is not finite at step {step}: {bad}{frames}"
+        raise NotFiniteError(f"the fit stopped: {what}; {REMEDY}")
+    return total
+
+
+def finite_loss(
+    objective: RegistrationObjective, parameters: Parameters, robust: bool, window: Window, step: int
+) -> Tensor:
+    """The loss of a window, a number.
+
+    Raises:
+        NotFiniteError: it is not finite; the message names the terms and the frames.
+    """
+    losses = objective(parameters, robust, window)
+    try:
+        return finite_sum(losses, step)
+    except NotFiniteError:
+        finite_sum(losses, step, _named(objective, frames_at_fault(objective, parameters, window)))
+        raise
+
+
+def require_finite_gradient(
+    objective: RegistrationObjective, gradient: Mapping[str, Tensor], step: int
+) -> None:
+    """Refuse a gradient that is not finite, which Adam would carry into every later step.
+
+    Raises:
+        NotFiniteError: names the parameters and the frames.
+    """
+    if finite(gradient.values()):
+        return
+    for name, value in gradient.items():
+        if not bool(value.isfinite().all()):
+            rows = rows_not_finite(value) if name in PER_FRAME else []
+            raise NotFiniteError(
+                f"the fit stopped: the gradient of {name} is not finite at step {step}"
+                f"{_named(objective, rows)}; {REMEDY}"
+            )
+
+
+@torch.no_grad()
+def frames_at_fault(objective: RegistrationObjective, parameters: Parameters, window: Window) -> list[int]:
+    """The rows of the clip, of a window's posed frames, whose parameters or pixels are not finite."""
+    pixels = objective.predict(parameters, window).pixels
+    tensors = [getattr(parameters, name) for name in PER_FRAME] + [pixels]
+    return sorted({window.low + row for tensor in tensors for row in rows_not_finite(tensor)})
+
+
+def _named(objective: RegistrationObjective, rows: list[int]) -> str:
+    numbers = [str(int(objective.observations.frames[row])) for row in rows]
+    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return f", in frame {', '.join(numbers[:_NAMED])}{more}" if numbers else ""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pipeline.body import joint_orientations
 from pipeline.body.joints import joint_index
-from stages.fit.views import Views
+from stages.fit.camera_batch import CameraBatch
 
 TURNED = 0.4
 """Under this cosine (66 degrees) a face is turned away; half of its points are then behind the other half."""
@@ -73,7 +73,7 @@ def points_facing(face: np.ndarray, ears: np.ndarray, threshold: float) -> np.nd
     return np.where(crossed, -np.abs(cosine), cosine)
 
 
-def pose_facing(rotation: Tensor, parents: tuple[int, ...], views: Views) -> np.ndarray:
+def pose_facing(rotation: Tensor, parents: tuple[int, ...], views: CameraBatch) -> np.ndarray:
     """The cosine from the head of a posed body: [T, 55, 3] rotation vectors -> [T]."""
     head = joint_orientations(rotation, parents)[:, joint_index("head")]
     ahead = (views.rotation @ head)[..., 2]  # the face looks along its +Z

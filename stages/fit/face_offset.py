@@ -23,7 +23,6 @@ def spread_matrix(body: BodyModel, controls: PointSet) -> Tensor:
     apart. Eyeballs stay, being rigid.
 
     Args:
-        body: the body.
         controls: C landmarks on the face's surface.
 
     Returns:

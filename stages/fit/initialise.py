@@ -18,10 +18,10 @@ from torch.nn.functional import normalize
 from pipeline.body import joint_orientations
 from pipeline.body.joints import JAW, joint_index
 from pipeline.clip.keypoints import Keypoints
+from stages.fit.camera_batch import CameraBatch
 from stages.fit.face import FaceTarget
 from stages.fit.observations import POSE_HIPS, POSE_SHOULDERS, Observations
 from stages.fit.parameters import LandmarkModel, Parameters, parameters_of
-from stages.fit.views import Views
 
 ARMS_DOWN = 1.1
 """Radians about Z by which the shoulders are lowered from the T pose."""
@@ -38,15 +38,12 @@ _UNSEEN_DISTANCE = 3.0  # metres before the camera for a body of which nothing i
 
 
 def initial_parameters(
-    keypoints: Keypoints, observations: Observations, model: LandmarkModel, views: Views
+    keypoints: Keypoints, observations: Observations, model: LandmarkModel, views: CameraBatch
 ) -> Parameters:
     """The start of the optimisation for T frames.
 
     Args:
         keypoints: the clip's detections; only their 3D pose is used here.
-        observations: what the fit aims at.
-        model: the landmarks.
-        views: the cameras.
     """
     count = len(observations.frames)
     rotation = torch.zeros(count, 55, 3)
@@ -68,7 +65,6 @@ def with_face(parameters: Parameters, target: FaceTarget, movable: Tensor) -> Pa
 
     Args:
         parameters: of T frames.
-        target: the face.
         movable: [55] bool, joints that are fitted; the jaw stays where it may not move.
     """
     if not target.valid.any():
@@ -79,7 +75,7 @@ def with_face(parameters: Parameters, target: FaceTarget, movable: Tensor) -> Pa
     return dataclasses.replace(parameters, expression=expression, jaw=jaw if moved else parameters.jaw)
 
 
-def bend_limbs(rotation: Tensor, keypoints: Keypoints, model: LandmarkModel, views: Views) -> None:
+def bend_limbs(rotation: Tensor, keypoints: Keypoints, model: LandmarkModel, views: CameraBatch) -> None:
     """Turn arms and legs, in place, as the 3D landmarks say where all of a limb is scored well.
 
     In the picture alone a forearm that points at the camera and one that points away from it look the
@@ -90,7 +86,6 @@ def bend_limbs(rotation: Tensor, keypoints: Keypoints, model: LandmarkModel, vie
         rotation: [T, 55, 3], rotation vectors; the torso's is set already.
         keypoints: the clip's detections; its 3D pose is used.
         model: the landmarks, for the rest joints.
-        views: the cameras.
     """
     world = torch.from_numpy(keypoints.pose_world)
     above = joint_orientations(rotation, model.parents)
@@ -120,7 +115,7 @@ def shortest_turn(start: Tensor, end: Tensor) -> Tensor:
     return roma.rotvec_to_rotmat(axis / sine.clamp_min(1e-8) * angle)
 
 
-def torso_orientation(keypoints: Keypoints, observations: Observations, views: Views) -> Tensor:
+def torso_orientation(keypoints: Keypoints, observations: Observations, views: CameraBatch) -> Tensor:
     """The pelvis' rotation in the world: [T, 3], rotation vectors, continuous over time.
 
     Where shoulders and hips are seen they give the whole rotation; where shoulders alone are, they give
@@ -187,7 +182,7 @@ def continuous(rotation: Tensor) -> Tensor:
     return flat.reshape(rotation.shape)
 
 
-def weak_perspective(points: Tensor, observations: Observations, views: Views) -> Tensor:
+def weak_perspective(points: Tensor, observations: Observations, views: CameraBatch) -> Tensor:
     """The translation that puts landmarks near their pixels, by linear least squares.
 
     Each frame has a scale s and a shift: pixel = s * place + shift over its reliable points, which gives
@@ -196,8 +191,6 @@ def weak_perspective(points: Tensor, observations: Observations, views: Views) -
 
     Args:
         points: [T, N, 3], posed landmarks without translation, in the world.
-        observations: what was seen.
-        views: the cameras.
 
     Returns:
         [T, 3], metres, in the world.
@@ -246,6 +239,6 @@ def _interpolated(values: Tensor, known: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(columns, axis=1)).to(values.dtype)
 
 
-def _to_world(in_camera: Tensor, views: Views) -> Tensor:
+def _to_world(in_camera: Tensor, views: CameraBatch) -> Tensor:
     """[T, 3] in the camera's axes -> [T, 3] in the world."""
     return views.to_world(in_camera[:, None])[:, 0]

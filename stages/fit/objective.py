@@ -16,13 +16,13 @@ from torch import Tensor
 from pipeline.body import BodyModel, mean_identity, rest_joints
 from pipeline.body.joints import BODY_POSE, JAW
 from stages.fit import terms
+from stages.fit.camera_batch import CameraBatch
 from stages.fit.face import FaceTarget, sface
 from stages.fit.face_offset import mirror_matrix
 from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import Directions, Observations
 from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
 from stages.fit.settings import FitSettings
-from stages.fit.views import Views
 from stages.fit.windows import Window, windows
 
 LONG_SIDE = 512.0
@@ -60,7 +60,7 @@ class Prediction:
 
 
 @dataclasses.dataclass(frozen=True)
-class Face:
+class FaceTerm:
     """The two sides of L_sface: the face that was fitted first, and its points on the body."""
 
     target: FaceTarget
@@ -74,7 +74,7 @@ class Face:
         return sum((SFACE[name] * value.mean() for name, value in found.items()), points.new_zeros(()))
 
 
-class Objective:
+class RegistrationObjective:
     """The loss of a clip as a function of its parameters."""
 
     def __init__(
@@ -82,11 +82,11 @@ class Objective:
         body: BodyModel,
         observations: Observations,
         model: LandmarkModel,
-        views: Views,
+        views: CameraBatch,
         initial: Parameters,
         movable: Tensor,  # [55]
         settings: FitSettings,
-        target: Face | None = None,
+        target: FaceTerm | None = None,
     ) -> None:
         """Prepare what does not change during the optimisation."""
         self.target = target

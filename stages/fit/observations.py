@@ -106,8 +106,6 @@ def observe(
     """Choose the point sets that the estimator gave and mask what cannot be trusted.
 
     Args:
-        keypoints: the clip's detections.
-        landmarks: where the points lie on the body.
         threshold: tau, the score under which a point is masked.
         sizes: [T, 2], width and height of each frame in pixels.
         masked: False sets m = 1 for every finite detection with a place or a score.
@@ -245,7 +243,6 @@ def visible(points: np.ndarray, threshold: float, sizes: np.ndarray) -> np.ndarr
 
     Args:
         points: [T, ..., C], x and y first, the score last.
-        threshold: tau.
         sizes: [T, 2], width and height.
     """
     limit = sizes.reshape(len(points), *[1] * (points.ndim - 2), 2)

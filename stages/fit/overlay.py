@@ -29,10 +29,6 @@ def overlays(
     """Every frame of the clip with the mesh over it: [H, W, 3] uint8 RGB each.
 
     Args:
-        body: the body.
-        identity: who.
-        poses: the T poses.
-        cameras: frame number -> camera.
         frames: the folder of the clip's pictures.
         opacity: of the mesh, 0 to 1.
     """
@@ -60,7 +56,6 @@ def sheet(frames: Path, masks: Path, poses: Poses, drawn: Mapping[int, np.ndarra
 
     Args:
         frames, masks: folders of the clip's pictures.
-        poses: the T poses.
         drawn: row -> overlay.
     """
     tiles = []

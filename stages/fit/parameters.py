@@ -188,7 +188,6 @@ def landmark_model(body: BodyModel, points: PointSet, betas: int, spread: Tensor
     """The landmarks of a body.
 
     Args:
-        body: the body.
         points: N landmarks.
         betas: B, how many shape coefficients are used.
         spread: [V, C], Delta V_face at each vertex for each face control.

@@ -18,16 +18,16 @@ from pipeline.errors import UserError
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import InitialPoses
 from stages.fit.adam import Recorder, optimise
+from stages.fit.camera_batch import CameraBatch, stack
 from stages.fit.face import fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
-from stages.fit.initial_poses import initial_facing, initial_from_files
 from stages.fit.initialise import continuous, initial_parameters, with_face
-from stages.fit.objective import Face, Objective
+from stages.fit.initialise_from_poses import initial_facing, initial_from_files
+from stages.fit.objective import FaceTerm, RegistrationObjective
 from stages.fit.observations import Observations, observe
 from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
 from stages.fit.settings import FitSettings
-from stages.fit.views import Views, stack
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,11 +67,7 @@ def register(
     """Fit the body to a clip.
 
     Args:
-        body: the body.
-        landmarks: where keypoints lie on it.
         keypoints: detections of T frames.
-        cameras: frame number -> camera.
-        settings: the stage's.
         report: called after each step with a note on the loss.
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.
@@ -100,8 +96,8 @@ def register(
     face = None
     if target is not None:
         initial = with_face(initial, target, movable)
-        face = Face(target, landmark_model(body, target.points, betas, spread))
-    objective = Objective(body, observations, model, views, initial, movable, settings, face)
+        face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
+    objective = RegistrationObjective(body, observations, model, views, initial, movable, settings, face)
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
@@ -124,7 +120,7 @@ def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) ->
     return keypoints
 
 
-def _outcome(objective: Objective, fitted: Parameters, spread: Tensor) -> tuple[Identity, Poses]:
+def _outcome(objective: RegistrationObjective, fitted: Parameters, spread: Tensor) -> tuple[Identity, Poses]:
     """Identity and poses; joints that nothing was seen of are where they began."""
     observations = objective.observations
     with torch.no_grad():
@@ -147,7 +143,7 @@ def frozen_groups(settings: FitSettings, face_is_seen: bool) -> frozenset[str]:
     return frozenset(frozen)
 
 
-def views_of(keypoints: Keypoints, cameras: Mapping[int, Camera]) -> Views:
+def views_of(keypoints: Keypoints, cameras: Mapping[int, Camera]) -> CameraBatch:
     """The cameras of the frames that have keypoints.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The fit stage: keypoints in, identity and poses out."""
+"""Running the fit stage: keypoints in, identity and poses out."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from pipeline.files.tables import write_table
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.run.stage import Context
-from stages.fit.initial_poses import given_poses, keep_given
+from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
@@ -113,7 +113,6 @@ def group_means(error: Tensor, observations: Observations) -> dict[str, float]:
 
     Args:
         error: [T, N], pixels, NaN where masked.
-        observations: whose points they are.
     """
     means = {name: error[:, observations.of(name)].nanmean() for name in GROUPS}
     return {name: float(mean) for name, mean in means.items() if torch.isfinite(mean)}
@@ -126,9 +125,7 @@ def write_residuals(path: Path, error: Tensor, observations: Observations) -> No
     the group; ``pixels``, its reprojection error. Masked keypoints have no row.
 
     Args:
-        path: the file.
         error: [T, N], pixels, NaN where masked.
-        observations: whose points they are.
     """
     group = observations.group.numpy()
     within = np.zeros(len(group), np.int32)

@@ -1,4 +1,4 @@
-"""What can be set about the fit; lengths in metres, angles in radians."""
+"""Settings of the fit; lengths in metres, angles in radians."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FitSettings:
     minibatch: Count = setting(256, "frames posed at a time: memory does not grow with the clip")
     learning_rate: Factor = setting(1.0, "factor on Adam's step of every group of parameters")
 
-    # Objective
+    # RegistrationObjective
     masked: bool = setting(True, "m of Eq. 2; false trusts every detection, also outside the picture")
     score_threshold: Fraction = setting(0.4, "tau: keypoints that score less are masked (Eq. 2)")
     betas: Coefficients = setting(100, "shape coefficients, as many of these as the body has")

@@ -86,7 +86,6 @@ class _Filter:
         Args:
             times: [T], frame numbers, increasing.
             measured: [T] bool, at least one of them.
-            window: frames.
             order: the polynomials' degree.
         """
         self.rows = np.flatnonzero(measured)

@@ -2,7 +2,8 @@
 
 They return unreduced values; ``objective.py`` weights and sums them. Terms that the paper names carry
 its symbol and equation number. Where the paper takes an L1 norm of parameters this version squares
-them: a body part that is hardly seen then returns to its prior without being pinned to it.
+them: a small departure from the prior then costs little, and a body part that is hardly seen still returns
+to it.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ def keypoint_loss(
         projected: where the points are seen in the model, pixels.
         target: K, where they were detected, pixels.
         mask: m, 0 or 1.
-        saturation: the error in pixels that the loss of a point tends to, e s / (e + s), so that a
-            wrong detection pulls no harder the farther it is; None leaves it linear.
+        saturation: upper limit of a point's loss, pixels: e s / (e + s), so that a wrong detection
+            pulls no harder the farther it is; None leaves it linear.
 
     Returns:
         [T, N], pixels, 0 where masked.
@@ -100,7 +101,7 @@ def direction_loss(start: Tensor, end: Tensor, unit: Tensor) -> Tensor:
 
 
 def in_front_loss(depth: Tensor, chest: Tensor, distance: float) -> Tensor:
-    """The depth by which points seen before the chest are not ``distance`` in front of it, squared.
+    """The squared depth that points lack to be ``distance`` in front of the chest, where they are seen.
 
     With one camera the depth of a hand is free, and hands sink into the torso.
 
@@ -129,7 +130,7 @@ def joint_limit_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def velocity(values: Tensor, times: Tensor) -> Tensor:
-    """Change a frame between neighbours, times the square root of their distance.
+    """Differences of neighbouring frames, divided by the square root of the frames between them.
 
     Its square summed over a gap of dropped frames is what the same motion, spread evenly over the
     missing frames, would have given.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from pipeline.clip.keypoints import write_keypoints
 from pipeline.clip.records import Footage, write_cameras, write_footage, write_split
 from pipeline.errors import UserError
-from pipeline.pose_files import RECORD, write_record
+from pipeline.pose_files import INITIAL_POSES, write_initial_poses
 from stages.ingest.datasets import Recording, open_recording
 from stages.ingest.mannequin.footage import run_mannequin
 from stages.ingest.preview import write_preview
@@ -52,7 +52,7 @@ def run(context: Context) -> None:
     write_split(output / "split.json", split)
     write_footage(output / "footage.json", describe(recording, found))
     if found.poses is not None:
-        write_record(output / RECORD, found.poses)
+        write_initial_poses(output / INITIAL_POSES, found.poses)
     write_preview(output, detected.keypoints)
     context.log(
         f"{len(frames)} of {detected.read} frames of {detected.width}x{detected.height} kept, "

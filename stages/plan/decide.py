@@ -1,4 +1,4 @@
-"""From numbers to decisions. The thresholds were chosen on mannequins, whose content is known."""
+"""Decisions from measured numbers. Thresholds were chosen on mannequins, whose content is known."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def decide(inputs: PlanInputs, settings: PlanSettings) -> Plan:
 
 
 def forced(decision: Decision, settings: PlanSettings) -> Decision:
-    """A decision after its setting was heard."""
+    """A decision, replaced by its setting where that is not ``auto``."""
     if decision.effect in GATHERED:
         return decision
     choice = getattr(settings, decision.effect)
@@ -82,7 +82,7 @@ def forced(decision: Decision, settings: PlanSettings) -> Decision:
 
 
 def structure_from_motion(inputs: PlanInputs) -> Decision:
-    """What ingest decided about the cameras."""
+    """The decision that ingest took about the cameras."""
     record = inputs.clip.footage.camera
     source, moved = record.get("source", "known"), record.get("displacement")
     on = source in ("sfm", "rotation")
@@ -101,7 +101,7 @@ def structure_from_motion(inputs: PlanInputs) -> Decision:
 
 
 def face_registration(inputs: PlanInputs) -> Decision:
-    """What fit decided about the face."""
+    """The decision that fit took about the face."""
     found, frames = inputs.face["registered"], inputs.face["frames"]
     off = inputs.face["source"] == "off"
     why = "switched off by fit.face=off" if off else f"{found} of {frames} frames show a face to register"
@@ -109,14 +109,14 @@ def face_registration(inputs: PlanInputs) -> Decision:
 
 
 def part_seen(effect: str, seen: Mapping[str, float]) -> Decision:
-    """Whether a part of the body is ever seen."""
+    """On if a part of the body is ever seen."""
     share = seen[effect.removeprefix("seen_")]
     why = f"at most {share:.0%} of it lies in a training frame's picture"
     return Decision(effect, share >= PART_SEEN, share, PART_SEEN, "of its vertices in one frame", why)
 
 
 def residual(inputs: PlanInputs, part: str, seen: bool) -> Decision:
-    """Whether a part shows enough pixels for colours of its own in each frame."""
+    """On if a part shows enough pixels for colours of its own in each frame."""
     pixels, name = part_pixels(inputs.clip, part), part.replace("_", " ")
     on = seen and pixels >= RESIDUAL_PIXELS
     if not seen:
@@ -129,7 +129,7 @@ def residual(inputs: PlanInputs, part: str, seen: bool) -> Decision:
 
 
 def face_loss(inputs: PlanInputs, made: Mapping[str, Decision]) -> Decision:
-    """Whether there is a registered face large enough to be compared."""
+    """On if there is a registered face large enough to be compared."""
     pixels, registered = part_pixels(inputs.clip, "face"), made["face_registration"].on
     on = registered and made["seen_face"].on and pixels >= RESIDUAL_PIXELS
     why = f"the registered face is {pixels:.0f} pixels across" if registered else "no face was registered"
@@ -137,14 +137,14 @@ def face_loss(inputs: PlanInputs, made: Mapping[str, Decision]) -> Decision:
 
 
 def gate(scores: np.ndarray) -> Decision:
-    """Whether the scores of the fitted body call for the visibility gate."""
+    """On if the scores of the fitted body call for the visibility gate."""
     found = evidence_threshold(scores)
     cut = found.cut if found.closed else 0.0
     return Decision("visibility_gate", found.closed, cut, LEAST_CUT, "of the body's vertices", found.why)
 
 
 def azimuths(inputs: PlanInputs) -> Decision:
-    """Whether a side of the body is never seen."""
+    """On if a side of the body is never seen."""
     joints = rest_joints(inputs.clip.body, inputs.clip.identity)
     widest, unseen = unseen_azimuths(inputs.clip, joints)
     on = widest > UNSEEN_RANGE
@@ -155,7 +155,7 @@ def azimuths(inputs: PlanInputs) -> Decision:
 
 
 def subdivision(inputs: PlanInputs) -> Decision:
-    """Whether there are more pixels than Gaussians, a vertex of the body each; and for how many levels."""
+    """On if there are more pixels than Gaussians, a vertex each; its value is the number of levels."""
     pixels = gaussian_pixels(inputs)
     levels = max(0, math.ceil(math.log2(pixels / GAUSSIAN_PIXELS))) if pixels else 0
     why = f"the body's vertices that a training frame shows stand {pixels:.1f} pixels apart"
@@ -163,21 +163,21 @@ def subdivision(inputs: PlanInputs) -> Decision:
 
 
 def poses_follow(inputs: PlanInputs) -> Decision:
-    """Whether the pose changes enough for shape and colour to follow it."""
+    """On if the pose changes enough for shape and colour to follow it."""
     change = pose_change(inputs.clip)
     why = f"the keypoints change their shape by {change:.1%} of the person's size"
     return Decision("pose_heads", change >= POSE_CHANGE, change, POSE_CHANGE, "of the person's size", why)
 
 
 def refinement(inputs: PlanInputs) -> Decision:
-    """Whether the fit leaves the training frames' poses anything to gain."""
+    """On if the fit leaves the training frames' poses anything to gain."""
     pixels = mean_error(inputs, inputs.clip.split.train)
     why = f"the fit's points are {pixels:.2f} pixels off in training frames"
     return Decision("pose_refinement", pixels >= FIT_PIXELS, pixels, FIT_PIXELS, "pixels", why)
 
 
 def test_time(inputs: PlanInputs) -> Decision:
-    """Whether held-out poses are too far off for their scores to say much of the avatar."""
+    """On if held-out poses are too far off for their scores to say much of the avatar."""
     pixels = mean_error(inputs, inputs.clip.split.test)
     why = (
         f"the fit's points are {pixels:.2f} pixels off in held-out frames"

@@ -1,4 +1,4 @@
-"""The numbers that the plan decides by, each from what ingest and fit published."""
+"""Measurements that the plan decides by, from what ingest and fit published."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
 
 @dataclasses.dataclass(frozen=True)
 class PlanInputs:
-    """What the plan looks at.
+    """The inputs of the plan.
 
     Attributes:
         clip: the clip and the fitted person.
@@ -84,7 +84,7 @@ def _face(path: Path) -> dict[str, Any]:
 
 
 def visibility(inputs: PlanInputs) -> tuple[np.ndarray, dict[str, float]]:
-    """How often the fitted body's vertices lie in the training frames' pictures.
+    """The share of training frames in whose pictures each vertex of the fitted body lies.
 
     Returns:
         The scores, [V] in [0, 1], and for each part of the body the largest share of its vertices that a
@@ -105,7 +105,7 @@ def visibility(inputs: PlanInputs) -> tuple[np.ndarray, dict[str, float]]:
 
 
 def gaussian_pixels(inputs: PlanInputs) -> float:
-    """How far the body's vertices stand from each other in the picture, pixels.
+    """The distance of the body's vertices from each other in the picture, pixels.
 
     The root of the area that each has of what faces the camera within the person's box: the mean over
     ``LOOKED_AT`` training frames. 0 where none of them shows anything.
@@ -120,7 +120,7 @@ def gaussian_pixels(inputs: PlanInputs) -> float:
 
 
 def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
-    """Of one frame; 0 where no face of the mesh is seen. vertices [V, 3] world, faces [F, 3]."""
+    """The distance in one frame; 0 if no face of the mesh is seen. vertices [V, 3] world, faces [F, 3]."""
     pixels, depth = project(camera, vertices), to_camera(camera, vertices)[:, 2]
     corners = pixels[faces.long()]  # [F, 3, 2]
     middle = corners.mean(1)
@@ -149,7 +149,7 @@ def part_pixels(clip: FittedClip, part: str) -> float:
 
 
 def pose_change(clip: FittedClip) -> float:
-    """How far the person changes shape in the picture, in parts of the person's size.
+    """The change of the person's shape in the picture, in parts of the person's size.
 
     Joints that are not seen are fitted to anything, so the fit's own angles say little here; the trusted
     keypoints of each frame are laid over their mean shape instead (moved, turned, scaled), and what is
@@ -192,7 +192,6 @@ def unseen_azimuths(clip: FittedClip, joints: Tensor) -> tuple[float, tuple[floa
     """The sides of the body that no training frame shows.
 
     Args:
-        clip: the clip.
         joints: [55, 3], rest joints; the first is the pelvis.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What can be set about the plan: each decision can be taken out of its hands.
+"""Settings of the plan: each decision can be overridden.
 
 ``auto`` decides by the number measured. Structure from motion is decided by ``ingest.cameras`` and face
 registration by ``fit.face``; the plan gathers what came of them.

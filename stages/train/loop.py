@@ -16,7 +16,7 @@ from pipeline.metrics import Lpips
 from stages.train import schedule
 from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import TrainingData
-from stages.train.objective import Objective
+from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings, learning_rates
 
@@ -81,7 +81,7 @@ class Trainer:
         """
         self.avatar, self.poses, self.settings, self.data = avatar, poses, settings, data
         self.hooks: dict[str, Hook] = dict(hooks or {})
-        self.objective = Objective(avatar, poses, data, settings, network, self._on_frame)
+        self.objective = TrainingObjective(avatar, poses, data, settings, network, self._on_frame)
         self.iteration = 0
         self._avatar_optimizer, self._pose_optimizer = _optimizers(avatar, poses, settings)
         self._update_phase()

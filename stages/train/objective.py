@@ -25,10 +25,10 @@ from pipeline.device import moved
 from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import render
 from stages.train import losses, schedule
+from stages.train.body_regions import PartWeights, Regions, find_regions
 from stages.train.data import TrainingData
 from stages.train.frame_visibility_cache import FrameVisibilityCache
 from stages.train.poses import PoseRefinement
-from stages.train.regularisers import PartWeights, Regions, find_regions
 from stages.train.rendered_frame import RenderedFrame, StaticAvatar
 from stages.train.schedule import Draw
 from stages.train.settings import TrainSettings
@@ -164,7 +164,7 @@ def describe_objective(settings: TrainSettings) -> str:
     return "objective: " + ", ".join(found)
 
 
-class Objective:
+class TrainingObjective:
     """The weighted terms of one optimiser step.
 
     Attributes:

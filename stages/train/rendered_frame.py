@@ -14,9 +14,9 @@ from pipeline.clip.views import View
 from pipeline.metrics import Lpips
 from pipeline.splat import Rendering
 from stages.train import losses
+from stages.train.body_regions import Regions, unmixed
 from stages.train.face import Pasted, face_triangles, paste
 from stages.train.poses import PoseRefinement
-from stages.train.regularisers import Regions, unmixed
 from stages.train.schedule import Draw
 
 

@@ -9,7 +9,7 @@ import torch
 
 from pipeline.clip.plan import read_plan
 from pipeline.config.settings import as_dict
-from pipeline.device import moved, resolve
+from pipeline.device import moved, product_dtype, resolve
 from pipeline.metrics import Lpips
 from pipeline.numba_kernels import threads
 from pipeline.run.compile_timer import CompileTimer, compile_timer
@@ -55,7 +55,8 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     plan = read_plan(inputs["plan"] / "plan.json")
     settings = apply_representation(apply_plan(context.settings, plan))
     device = resolve(settings.device)
-    log(f"computes on {device}")
+    kind = str(product_dtype(device, settings.half_precision)).removeprefix("torch.")
+    log(f"computes on {device}, heads in {kind}")
     context.timing("device", str(device))
     started = time.monotonic()
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None

@@ -47,13 +47,15 @@ MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 class TrainSettings:
     """Settings of the train stage; every schedule counts iterations, never seconds.
 
-    What begins with a ``_from`` is a fraction of the run; a heads' or the gate's 1 means never.
+    Settings that end in ``_from`` are fractions of the run; 1 means never where they start heads or the gate.
     """
 
     seed: Seed = setting(0, "of the initial weights and of every random draw")
     iterations: Iterations = setting(1000, "optimiser steps")
     batch: Batch = setting(1, "frames an optimiser step; they share one decode of the static part")
-    half_precision: bool = setting(True, "heads in bfloat16")
+    half_precision: bool = setting(
+        True, "heads in bfloat16 where the processor multiplies it faster (AVX-512, a GPU)"
+    )
     held_out_every: Count = setting(250, "iterations between points of the held-out curve")
     held_out_frames: CountOrNone = setting(3, "frames of each such point")
     checkpoint_every: Count = setting(250, "iterations between checkpoints")

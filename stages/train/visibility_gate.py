@@ -3,11 +3,11 @@
 Each drawn frame shows the body vertices that lie in the crop around the person and in front of the camera.
 That is measured for gated vertices as for all others, by posing the bare body, which costs a millisecond.
 
-The score v_i is the share of the drawn frames (Eq. 6), over captured and generated frames apart, from
-the first iteration on and never forgotten. After the warm-up, and regularly again, a threshold is found in
-the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies below it is gated: it leaves
-``Avatar.surface``, and with it decoding, rendering and regularisation. Scores go on being measured, so
-that a region that comes into view later returns.
+The score v_i is the share of the drawn frames that show vertex i (Eq. 6). Captured and generated frames are
+counted separately, from the first iteration to the last. After the warm-up, and regularly again, a
+threshold is found in the captured frames' scores (:mod:`pipeline.avatar.otsu_threshold`) and what lies
+below it is gated: it leaves ``Avatar.surface``, and with it decoding, rendering and regularisation. Scores
+go on being measured, so that a region that comes into view later returns.
 
 The counters and the avatar's own mark of what is active are buffers; a checkpoint holds them, and a
 resumed run goes on exactly as one that was never stopped.

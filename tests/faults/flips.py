@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
+from pipeline.config.request import Request
 from pipeline.store.verify import look_at, remedy
 from tests.faults.project import Project
 
@@ -45,7 +46,7 @@ def unnoticed(project: Project, draw: random.Random) -> tuple[int, list[str]]:
         stage = kind.split("/")[0]
         folder = next(one for one in project.store.folders(project.subject, stage) if one in path.parents)
         damage = look_at(folder)
-        if not damage.files or f"doit run {stage}:{project.subject}" not in remedy(damage, {}, {}):
+        if not damage.files or f"doit run {stage}:{project.subject}" not in remedy(damage, Request(), {}):
             missed.append(kind)
         path.write_bytes(whole)
     return len(files), missed

@@ -12,7 +12,10 @@ from tests.faults.observe import differences, litter, published, wrongs
 from tests.faults.project import Project, toy_project
 from tests.faults.runs import MOMENTS, TARGETS, Run
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="it watches processes as Linux shows them")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="it watches processes as Linux shows them"),
+]
 STAGES = ("gather", "bend", "paint")
 SEED = 3
 

@@ -71,6 +71,7 @@ def fill(folder, pages_left):
     return ballast
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_at_any_moment_leaves_nothing_half_published(toy, small_disk):
     store = small_disk / "store"
     words, text = (f"artifacts={store}",), "ann 1.0" * 2000  # 14 kB, four pages

@@ -1,6 +1,8 @@
 """The rules that keep the house in order, checked on the code itself."""
 
 import ast
+import collections
+import graphlib
 import subprocess
 import sys
 
@@ -26,6 +28,68 @@ def imports(path):
 
 def sources(folder):
     return sorted((REPOSITORY / folder).rglob("*.py"))
+
+
+def modules():
+    """Name -> path of every module of pipeline and stages; a package is its ``__init__``."""
+    found = {}
+    for path in [*sources("pipeline"), *sources("stages")]:
+        parts = path.relative_to(REPOSITORY).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def runtime_imports(node):
+    """Modules and names that run-time code imports, inside functions too; not what types alone ask for."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            continue
+        if isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            yield from (f"{child.module}.{alias.name}" for alias in child.names)
+        yield from runtime_imports(child)
+
+
+def import_graph(found):
+    """Module -> the modules that it imports, and the packages of these that it is not itself within."""
+    graph = {}
+    for name, path in found.items():
+        graph[name] = set()
+        for imported in runtime_imports(ast.parse(path.read_text(encoding="utf-8"))):
+            target = imported if imported in found else imported.rpartition(".")[0]
+            ancestors = {target.rsplit(".", up)[0] for up in range(1, target.count(".") + 1)}
+            outside = {one for one in ancestors if not f"{name}.".startswith(f"{one}.")}
+            graph[name] |= ({target} | outside) & set(found) - {name}
+    return graph
+
+
+def test_no_circles():
+    graph = import_graph(modules())
+    assert sum(map(len, graph.values())) > 500
+    graphlib.TopologicalSorter(graph).prepare()  # CycleError names the circle
+
+
+def test_a_circle_is_found(tmp_path):
+    found = {name: tmp_path / name for name in ("one", "two")}
+    found["one"].write_text("def late():\n    import two\n")
+    found["two"].write_text("from one import late\n")
+    with pytest.raises(graphlib.CycleError):
+        graphlib.TopologicalSorter(import_graph(found)).prepare()
+
+
+def test_class_names_are_unique():
+    homes = collections.defaultdict(list)
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].append(name)
+    assert len(homes) > 100
+    assert not {name: places for name, places in homes.items() if len(places) > 1}
+
+
+def test_the_root_of_pipeline_stays_small():
+    assert len(list((REPOSITORY / "pipeline").glob("*.py"))) <= 10
 
 
 def test_pipeline_never_imports_stages():

@@ -11,8 +11,7 @@ from pipeline.clip.records import Split, read_cameras, write_split
 from pipeline.errors import UserError
 from pipeline.texture import robust_mean, weighted_median
 from stages.auxiliary import run as stage
-from stages.auxiliary.texture.complete import membrane, neighbours
-from stages.auxiliary.texture.shade import shading
+from stages.auxiliary.texture_generator import membrane, neighbours, shading
 from tests.stages.auxiliary_subject import FRAMES, context_for, write_clip
 
 SIZE = 48

@@ -14,7 +14,7 @@ from pipeline.clip.keypoints import empty_keypoints
 from pipeline.errors import UserError
 from pipeline.finite import NotFiniteError
 from stages.fit.adam import optimise
-from stages.fit.objective import Objective
+from stages.fit.objective import RegistrationObjective
 from stages.fit.outlier_frames import BODY_PAIRS, mask_outlier_frames
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
@@ -304,7 +304,7 @@ def test_a_camera_that_is_not_finite_stops_the_fit_and_is_named(model, clip):
 def test_a_slope_that_is_not_finite_stops_the_fit_and_is_named(model, clip, monkeypatch):
     """A loss that is finite where its slope is not: the root of nothing."""
     objective, initial, frozen = problem_of(model, clip)
-    original = Objective.__call__
+    original = RegistrationObjective.__call__
 
     def rooted(self, parameters, robust, window=None):
         losses = original(self, parameters, robust, window)
@@ -315,7 +315,7 @@ def test_a_slope_that_is_not_finite_stops_the_fit_and_is_named(model, clip, monk
             losses["init"] = losses["init"] + nothing.sqrt()
         return losses
 
-    monkeypatch.setattr(Objective, "__call__", rooted)
+    monkeypatch.setattr(RegistrationObjective, "__call__", rooted)
     with pytest.raises(NotFiniteError, match=r"gradient of transl is not finite at step .*frame .*5"):
         optimise(objective, initial, 10, frozen)
 
@@ -355,14 +355,14 @@ def test_windows_bound_the_memory_of_a_long_clip(model, clip):
     settings = FitSettings(iterations=2, minibatch=4)
     long = make_clip(*model, count=24)
     seen = []
-    original = Objective.predict
+    original = RegistrationObjective.predict
 
     def watched(self, parameters, window):
         seen.append(len(parameters.transl))
         return original(self, parameters, window)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Objective, "predict", watched)
+        patch.setattr(RegistrationObjective, "predict", watched)
         register(*model, long.keypoints, long.cameras, settings)
     assert max(seen) <= 4 + 2
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline import device
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body
 from pipeline.clip.frames import frame_path, write_frame, write_mask
@@ -190,9 +191,9 @@ def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
 # Rates
 
 
-@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak), 1e30])
+@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak)])
 def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(subject, tmp_path, factor):
-    """Finite ruins (100, 1e4) and overflow (1e30); before, the ruins were published."""
+    """Finite ruins; before, they were published. Rates that overflow are refused as settings."""
     names = ("learning_rate", "plane_learning_rate", "pose_learning_rate")
     rates = {name: factor * getattr(TINY, name) for name in names}
     settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "warm_up": 1, "face": 0.0}
@@ -221,7 +222,8 @@ def drift(subject, tmp_path, count, **settings):
     return np.array(taken), held_out_psnr(trainer, trainer.data.clip.split.test)
 
 
-def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path):
+def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path, monkeypatch):
+    monkeypatch.setattr(device, "multiplies_bfloat16", lambda device: True)
     half, single = (
         drift(subject, tmp_path / name, 6, half_precision=name == "half") for name in ("half", "single")
     )

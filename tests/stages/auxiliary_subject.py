@@ -17,7 +17,7 @@ from pipeline.clip.keypoints import write_keypoints
 from pipeline.clip.plan import write_plan
 from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
 from stages.auxiliary.settings import AuxiliarySettings
-from stages.auxiliary.turn import read_numbered_clip
+from stages.auxiliary.turntable_motion import read_numbered_clip
 from stages.ingest.mannequin.appearance import make_appearance
 from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.footage import Mannequin, make_mannequin

@@ -10,8 +10,8 @@ import torch
 
 from pipeline.body import is_part, mean_identity, rest_joints
 from pipeline.clip.camera import facing_camera
+from stages.fit.camera_batch import CameraBatch, stack
 from stages.fit.face.target import FaceModel
-from stages.fit.views import Views, stack
 
 SIZE, FOCAL = 256, 500.0
 
@@ -21,7 +21,7 @@ class FaceClip:
     """Face meshes [T, F, 3] of a person, their camera, and the truth behind them."""
 
     mesh: torch.Tensor
-    views: Views
+    views: CameraBatch
     neutral: torch.Tensor
     expression: torch.Tensor
     jaw: torch.Tensor

@@ -23,7 +23,7 @@ from pipeline.clip.camera import Camera, facing_camera, project
 from pipeline.clip.keypoints import Keypoints, empty_keypoints
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import initial_parameters
-from stages.fit.objective import Objective
+from stages.fit.objective import RegistrationObjective
 from stages.fit.observations import observe
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
 from stages.fit.registration import frozen_groups, views_of
@@ -104,7 +104,7 @@ def whole_body(clip: DetectedClip, body, landmarks: Landmarks) -> DetectedClip:
 
 def problem_of(
     model: tuple[BodyModel, Landmarks], clip: DetectedClip, betas: int = 4
-) -> tuple[Objective, Parameters, frozenset[str]]:
+) -> tuple[RegistrationObjective, Parameters, frozenset[str]]:
     """Objective, initial parameters and frozen groups, as the registration makes them without a face."""
     body, landmarks = model
     settings = FitSettings(face="off", betas=betas)
@@ -115,6 +115,6 @@ def problem_of(
     found = landmark_model(body, seen.points, settings.betas, spread)
     initial = initial_parameters(clip.keypoints, seen, found, views)
     movable = movable_joints(found, seen.mask.any(0), seen.vague)
-    objective = Objective(body, seen, found, views, initial, movable, settings)
+    objective = RegistrationObjective(body, seen, found, views, initial, movable, settings)
     frozen = frozen_groups(settings, face_is_seen=bool((seen.mask.any(0) & on_face).any()))
     return objective, initial, frozen

@@ -1,5 +1,6 @@
 """The animate stage: what it writes, and that other readers read it."""
 
+import dataclasses
 import json
 
 import av
@@ -9,13 +10,14 @@ import pytest
 import roma
 import torch
 
+from pipeline.avatar import pose_features
 from pipeline.body import PARTS, joint_index, load_body, mean_identity, pose_body, rest_joints
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
 from pipeline.splat import Gaussians, render
-from stages.animate.actor import Known, legs_share
-from stages.animate.layers import decode_srgb, layers_of
+from stages.animate.actor import PoseRange, legs_share
+from stages.animate.exr_layers import decode_srgb, exr_layers
 from stages.animate.run import on_background
 from tests.exr_reader import ffmpeg_colors, read_exr
 from tests.ply_reader import read_ply
@@ -156,7 +158,7 @@ def test_layers_of_two_flat_discs_by_hand():
         torch.full((2,), 0.95),
     )  # fmt: skip
     camera = facing_camera(80, 40, 60.0)
-    layers = layers_of(discs, torch.tensor([4, 7]), camera, render(discs, camera))
+    layers = exr_layers(discs, torch.tensor([4, 7]), camera, render(discs, camera))
     pixels = [(20, 25), (20, 47)]  # columns 40 - 0.5 * 60 / 2 and 40 + 0.5 * 60 / 4
     for (row, column), color, depth, part, angle in zip(
         pixels, colors, (2.0, 4.0), (5, 8), (0.0, 0.6), strict=True
@@ -259,16 +261,14 @@ def test_the_unseen_body_can_be_shown_in_its_base_colours(half, walk, baking):
 
 def test_heads_are_told_of_poses_that_training_showed():
     poses = moving_poses()
-    known = Known.of(poses, poses.frames[:-1])
-    inside = poses.rotation[2]
-    from pipeline.avatar import pose_features
-
-    assert torch.equal(known.nearest(inside), pose_features(inside))
-    far = inside.clone()
+    known = PoseRange.of(poses, poses.frames[:-1])
+    pose = poses.pose(poses.frames[2])
+    inside, far = pose_features(pose.rotation), pose.rotation.clone()
+    assert torch.equal(known.nearest(pose), inside)
     far[joint_index("left_knee")] = torch.tensor([1.5, 0.0, 0.0])  # nobody saw a knee bend
     far[joint_index("head"), 0] = 0.8  # it nodded by 0.1
-    told = known.nearest(far).view(54, 3, 2)
-    assert torch.equal(told[joint_index("left_knee") - 1], pose_features(inside).view(54, 3, 2)[3])
+    told = known.nearest(dataclasses.replace(pose, rotation=far)).view(54, 3, 2)
+    assert torch.equal(told[joint_index("left_knee") - 1], inside.view(54, 3, 2)[3])
     nod = torch.asin(told[joint_index("head") - 1, 2, 1])
     assert 0.05 < float(nod) <= 0.1 + 1e-5
 

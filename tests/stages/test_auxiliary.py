@@ -23,18 +23,23 @@ from pipeline.clip.keypoints import FACE, read_keypoints
 from pipeline.clip.plan import write_plan
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
-from pipeline.texture import VertexColors, robust_mean, weighted_median
+from pipeline.texture import (
+    VertexColors,
+    fine_surface,
+    gather_colors,
+    paint,
+    robust_mean,
+    weighted_median,
+)
 from stages.auxiliary import run as stage
-from stages.auxiliary import texture
 from stages.auxiliary.crop import find_framing
 from stages.auxiliary.folder import read_folder
 from stages.auxiliary.publish import NOTHING_NEW
 from stages.auxiliary.reference import score_frames
 from stages.auxiliary.settings import AuxiliarySettings
-from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turn_keypoints
-from stages.auxiliary.texture.complete import membrane, neighbours
-from stages.auxiliary.texture.shade import shading
-from stages.auxiliary.turn import ID_OFFSET, make_turn
+from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turntable_keypoints
+from stages.auxiliary.texture_generator import complete, membrane, neighbours, shading
+from stages.auxiliary.turntable_motion import ID_OFFSET, make_turntable_motion
 from tests.plans import plan_of
 from tests.stages.auxiliary_subject import BODY_FILE, body_and_landmarks, context_for, read, write_clip
 
@@ -67,7 +72,7 @@ def small(**changes):
 @pytest.mark.parametrize("motion", ["relaxed", "clip"])
 def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
     clip = read(full)
-    turn = make_turn(clip, small(motion=motion))
+    turn = make_turntable_motion(clip, small(motion=motion))
     pelvis = rest_joints(clip.body, clip.identity)[0]
     headings = []
     for row in range(8):
@@ -85,7 +90,7 @@ def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
 
 def test_a_turned_away_face_has_no_points_and_a_hidden_limb_a_lower_score(full):
     clip, landmarks = read(full), body_and_landmarks()[1]
-    points = turn_keypoints(clip, make_turn(clip, small()), landmarks)
+    points = turntable_keypoints(clip, make_turntable_motion(clip, small()), landmarks)
     assert points[0, FACE, 2].mean() > 0.9 and points[4, FACE, 2].mean() < 0.1
     assert points[0, 0, 2] == 1 and points[4, 0, 2] == 0
     assert np.isclose(points[2, :, 2], OCCLUDED).any()
@@ -155,13 +160,13 @@ def test_a_part_without_a_known_neighbour_takes_the_mean():
 def test_the_unseen_side_is_the_mirror_of_the_seen_one():
     """Known on the left only, with a pattern: the right gets the pattern, not a blur."""
     body = body_and_landmarks()[0]
-    surface = texture.fine_surface(body, 0)
+    surface = fine_surface(body, 0)
     points = body.v_template.numpy()
     pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
     known = points[:, 0] > 0
     color, weight = np.where(known[:, None], pattern, 0).astype(np.float32), known.astype(np.float32)
     seen = VertexColors(color, weight, known, np.zeros_like(points))
-    found = texture.complete(surface, seen)
+    found = complete(surface, seen)
     right = points[:, 0] < -0.02
     error = np.abs(found - pattern)[right]
     assert np.median(error) < 5 and error.mean() < 12
@@ -169,7 +174,7 @@ def test_the_unseen_side_is_the_mirror_of_the_seen_one():
 
 def test_an_unseen_back_is_shaded_as_the_light_says():
     """White seen from the front under a lamp in front: the slope is found, and the back is not as bright."""
-    surface = texture.fine_surface(body_and_landmarks()[0], 0)
+    surface = fine_surface(body_and_landmarks()[0], 0)
     normal = vertex_normals(body_and_landmarks()[0].v_template, surface.faces).numpy()
     known = normal[:, 2] > 0.1
     color = (150 * np.exp(0.4 * normal[:, 2:3]) * np.ones((1, 3))).astype(np.float32)
@@ -179,18 +184,18 @@ def test_an_unseen_back_is_shaded_as_the_light_says():
     back = normal[:, 2] < -0.5
     assert shade[back] == pytest.approx(shade[known].min(), abs=0.02)
     seen = VertexColors(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
-    assert np.median(texture.complete(surface, seen)[back]) < 165
+    assert np.median(complete(surface, seen)[back]) < 165
     assert not shading(color, np.zeros(len(color)), normal, surface.part).any()
 
 
 def test_projected_colours_are_those_of_the_frames(full):
     """The textured body in a frame of the clip looks like that frame."""
     clip = read(full)
-    surface = texture.fine_surface(clip.body, 1)
-    seen = texture.gather_colors(surface, clip, clip.split.train[:3])
-    colors = texture.complete(surface, seen)
+    surface = fine_surface(clip.body, 1)
+    seen = gather_colors(surface, clip, clip.split.train[:3])
+    colors = complete(surface, seen)
     frame = clip.split.train[1]
-    image, mask, _ = texture.paint(clip.cameras[frame], surface, clip.vertices(frame), colors)
+    image, mask, _ = paint(clip.cameras[frame], surface, clip.vertices(frame), colors)
     truth, inside = read_frame(clip.folder / "frames", frame), (mask > 250)
     inside &= cv2.erode(read_mask(clip.folder / "masks", frame), np.ones((5, 5), np.uint8)) > 250
     assert 0.1 < seen.known.mean() < 0.9
@@ -314,7 +319,7 @@ def test_the_frontal_frame_is_the_reference(full):
 
 def test_our_layout_and_pictures_alone(full, painted, tmp_path):
     clip = read(full)
-    turn = make_turn(clip, small())
+    turn = make_turntable_motion(clip, small())
     for row in range(4):
         (tmp_path / "frames").mkdir(exist_ok=True)
         write_frame(tmp_path / "frames", row, np.full((256, 144, 3), 10 * row, np.uint8))
@@ -329,7 +334,7 @@ def test_our_layout_and_pictures_alone(full, painted, tmp_path):
 
 def test_a_video(full, tmp_path):
     clip = read(full)
-    turn = make_turn(clip, small())
+    turn = make_turntable_motion(clip, small())
     write_video(tmp_path / "v.mp4", [np.full((128, 72, 3), 20 * k, np.uint8) for k in range(8)], 15)
     pictures = list(read_folder(tmp_path / "v.mp4", clip, turn, BODY_FILE).pictures)
     assert len(pictures) == 8 and pictures[3].image.shape == (256, 144, 3)
@@ -339,7 +344,7 @@ def test_a_video(full, tmp_path):
 def test_the_peers_generated_folder(full, painted, tmp_path):
     """What their tools would hold of our own turn comes back as the same bodies before the same cameras."""
     clip = read(full)
-    turn = make_turn(clip, small())
+    turn = make_turntable_motion(clip, small())
     peers = painted.output / "guidance" / "peers"
     theirs = tmp_path / "x_gen"
     for source in ("smplx_optimized/smplx_params", "cam_params"):
@@ -361,7 +366,7 @@ def test_the_peers_generated_folder(full, painted, tmp_path):
 
 def test_what_cannot_be_read_is_named(full, tmp_path):
     clip = read(full)
-    turn = make_turn(clip, small())
+    turn = make_turntable_motion(clip, small())
     with pytest.raises(UserError, match="does not exist"):
         read_folder(tmp_path / "nothing", clip, turn, BODY_FILE)
     with pytest.raises(UserError, match="no numbered pictures"):

@@ -6,12 +6,13 @@ import roma
 import torch
 
 from pipeline.body import Pose
+from pipeline.clip.boxes import Box, person_box
 from pipeline.clip.camera import project, to_camera
 from pipeline.clip.frames import spread_end_to_end
 from pipeline.orbit_cameras import Extent, orbit, relaxed_pose, visible_extent
 from pipeline.splat import Gaussians
 from stages.evaluate.baselines import mean_frame, nearest_frames
-from stages.evaluate.report.pictures import compare, comparison_sheet, person_box
+from stages.evaluate.report.pictures import compare, comparison_sheet
 from stages.evaluate.report.videos import turntable_pictures
 from stages.evaluate.scores import TableRow, score_table
 from stages.evaluate.statistics import means
@@ -118,7 +119,7 @@ def test_comparison_by_hand():
     image[5, 6] = 0.2
     one = compare(4, truth, image, 3.0, 31.0)
     assert one.error[5, 6].tolist() == [153, 153, 153] and one.error.sum() == 3 * 153
-    cropped = one.cropped((6, 5, 10, 9))
+    cropped = one.cropped(Box(6, 5, 10, 9))
     assert cropped.render.shape == (4, 4, 3) and cropped.render[0, 0, 0] == 51
     sheet = comparison_sheet([one, one], 3.0)
     assert sheet.shape[1] == 3 * 30 + 2 * 6 and sheet.dtype == np.uint8
@@ -127,5 +128,5 @@ def test_comparison_by_hand():
 def test_the_persons_box():
     mask = np.zeros((50, 60), np.uint8)
     mask[20:30, 5:40] = 255
-    assert person_box([mask], margin=8) == (0, 12, 48, 38)
-    assert person_box([np.zeros((5, 7), np.uint8)]) == (0, 0, 7, 5)
+    assert person_box([mask], margin=8) == Box(0, 12, 48, 38)
+    assert person_box([np.zeros((5, 7), np.uint8)]) is None

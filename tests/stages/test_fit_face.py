@@ -12,7 +12,7 @@ from pipeline.clip.keypoints import empty_keypoints
 from pipeline.numba_kernels import threads
 from stages.fit import terms
 from stages.fit.face import fit_face
-from stages.fit.face.mesh import densest_half, face_from_mesh
+from stages.fit.face.from_mesh import densest_half, face_from_mesh
 from stages.fit.face.target import FaceModel, aligned, face_model, make_target, sface
 from stages.fit.observations import observe
 from stages.fit.settings import FitSettings

@@ -10,10 +10,10 @@ import torch
 from pipeline.body import locate, mean_identity, pose_body
 from pipeline.clip.camera import facing_camera, project
 from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints
+from stages.fit.camera_batch import stack
 from stages.fit.face_direction import TURNED, mesh_facing, points_facing, pose_facing
 from stages.fit.hand_trust import trusted_flat_hands
 from stages.fit.observations import detected, observe
-from stages.fit.views import stack
 from tests.stages.fit_clip import load, make_clip, whole_body
 
 ANGLES = (0.0, 0.5, -0.8, 1.4, 2.4, 3.14)  # radians to either side

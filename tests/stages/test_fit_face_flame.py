@@ -13,14 +13,14 @@ import torch
 
 from pipeline.errors import UserError
 from pipeline.numba_kernels import threads
+from stages.fit.camera_batch import stack
 from stages.fit.face import fit_face
 from stages.fit.face.deca import FlameParameters, read_flame_parameters
-from stages.fit.face.flame import correspond, face_from_flame, transfer
 from stages.fit.face.flame_model import load_flame
+from stages.fit.face.from_flame import correspond, face_from_flame, transfer
 from stages.fit.face.target import aligned, face_model
 from stages.fit.observations import observe
 from stages.fit.settings import FitSettings
-from stages.fit.views import stack
 from tests.stages.face_clip import flame_arrays
 from tests.stages.fit_clip import load, make_clip
 from tests.unit.fake_body import Trap

@@ -12,16 +12,16 @@ from pipeline.body import mean_identity, pose_body, read_identity, read_poses
 from pipeline.clip.camera import Camera
 from pipeline.errors import UserError
 from pipeline.pose_files import (
-    RECORD,
+    INITIAL_POSES,
     InitialPoses,
     read_hand_mean,
-    read_record,
+    read_initial_poses,
     with_flat_hands,
+    write_initial_poses,
     write_peer_files,
-    write_record,
 )
 from pipeline.run.stage import Context
-from stages.fit.initial_poses import given_identity
+from stages.fit.initialise_from_poses import given_identity
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest
@@ -102,15 +102,15 @@ def test_what_is_not_there_or_anothers_cannot_be_kept(tmp_path, ingested):
     bare = tmp_path / "bare"
     bare.mkdir()
     for path in ingested.iterdir():
-        if path.name != RECORD:
+        if path.name != INITIAL_POSES:
             (bare / path.name).symlink_to(path)
     with pytest.raises(UserError, match="no poses to keep"):
         fit(tmp_path / "none", bare, given="keep")
-    record = read_record(ingested / RECORD)
-    write_record(bare / RECORD, dataclasses.replace(record, model="smplx"))
+    record = read_initial_poses(ingested / INITIAL_POSES)
+    write_initial_poses(bare / INITIAL_POSES, dataclasses.replace(record, model="smplx"))
     with pytest.raises(UserError, match="SMPLX_NEUTRAL"):
         fit(tmp_path / "other", bare, given="keep")
-    write_record(bare / RECORD, dataclasses.replace(record, transl=None))
+    write_initial_poses(bare / INITIAL_POSES, dataclasses.replace(record, transl=None))
     with pytest.raises(UserError, match="no place"):
         fit(tmp_path / "placeless", bare, given="keep")
 
@@ -165,21 +165,23 @@ def test_hand_coefficients_need_the_users_smplx_file(tmp_path):
 
 
 def test_records_come_back_and_damaged_ones_are_named(tmp_path, ingested):
-    record = read_record(ingested / RECORD)
-    write_record(tmp_path / RECORD, record)
-    again = read_record(tmp_path / RECORD)
+    record = read_initial_poses(ingested / INITIAL_POSES)
+    write_initial_poses(tmp_path / INITIAL_POSES, record)
+    again = read_initial_poses(tmp_path / INITIAL_POSES)
     for field in dataclasses.fields(record):
         one, other = getattr(record, field.name), getattr(again, field.name)
         assert torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
-    (tmp_path / RECORD).write_bytes((tmp_path / RECORD).read_bytes()[:500])
-    with pytest.raises(UserError, match=RECORD):
-        read_record(tmp_path / RECORD)
+    (tmp_path / INITIAL_POSES).write_bytes((tmp_path / INITIAL_POSES).read_bytes()[:500])
+    with pytest.raises(UserError, match=INITIAL_POSES):
+        read_initial_poses(tmp_path / INITIAL_POSES)
     with pytest.raises(ValueError, match="not finite"):
-        write_record(tmp_path / RECORD, dataclasses.replace(record, transl=record.transl * float("nan")))
+        write_initial_poses(
+            tmp_path / INITIAL_POSES, dataclasses.replace(record, transl=record.transl * float("nan"))
+        )
 
 
 def test_mean_identity_stands_for_a_missing_shape(shown, ingested):
-    record = with_flat_hands(read_record(ingested / RECORD), BODY_FILE, False)
+    record = with_flat_hands(read_initial_poses(ingested / INITIAL_POSES), BODY_FILE, False)
     bare = dataclasses.replace(record, betas=None, joint_offset=None, face_offset=None)
     found, mean = given_identity(bare, shown.body, "nothing"), mean_identity(shown.body)
     assert torch.equal(found.betas, mean.betas) and torch.equal(found.face_offset, mean.face_offset)

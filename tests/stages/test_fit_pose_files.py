@@ -22,10 +22,15 @@ from pipeline.body import (
 )
 from pipeline.clip.camera import facing_camera, to_camera
 from pipeline.clip.keypoints import empty_keypoints
-from pipeline.pose_files import read_hand_mean, read_initial_poses, tool_joints, write_peer_files
-from pipeline.pose_files.coefficients import is_official_smplx
+from pipeline.pose_files import (
+    is_official_smplx,
+    read_hand_mean,
+    read_smplx_json,
+    tool_joints,
+    write_peer_files,
+)
 from stages.fit.face_offset import on_skin, spread_matrix
-from stages.fit.initial_poses import initial_from_files
+from stages.fit.initialise_from_poses import initial_from_files
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model
 from stages.fit.registration import views_of
@@ -135,7 +140,7 @@ def test_the_tools_pose_the_same_body(tmp_path, body, identity, poses, moving, h
 
 def test_what_was_written_is_read_back(tmp_path, body, identity, poses, moving, hand_mean):
     write_peer_files(tmp_path, body, identity, poses, poses, moving, hand_mean)
-    start = read_initial_poses(tmp_path / "smplx_optimized" / "smplx_params", FRAMES, hand_mean)
+    start = read_smplx_json(tmp_path / "smplx_optimized" / "smplx_params", FRAMES, hand_mean)
     torch.testing.assert_close(start.rotation[:, 1:], poses.rotation[:, 1:], rtol=0, atol=1e-6)
     torch.testing.assert_close(start.expression[:, :38], poses.expression, rtol=0, atol=1e-6)
     joints = rest_joints(body, identity)
@@ -210,7 +215,7 @@ def exported(model, scene, hand_mean, tmp_path_factory):
     folder, truth = tmp_path_factory.mktemp("peers"), scene.clip.poses
     mean = Identity(torch.zeros(16), torch.zeros(55, 3), torch.zeros_like(model[0].v_template))
     write_peer_files(folder, model[0], mean, truth, truth, scene.clip.cameras, hand_mean)
-    return read_initial_poses(folder / "smplx_optimized" / "smplx_params", truth.frames, hand_mean)
+    return read_smplx_json(folder / "smplx_optimized" / "smplx_params", truth.frames, hand_mean)
 
 
 def begin(model, scene, start, notes=None):

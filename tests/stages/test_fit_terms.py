@@ -11,9 +11,8 @@ import torch
 from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
 from pipeline.finite import NotFiniteError
 from stages.fit import terms
-from stages.fit.adam import rate
+from stages.fit.adam import finite_sum, rate
 from stages.fit.face_offset import mirror_matrix, on_skin, spread_matrix
-from stages.fit.finite import finite_sum
 from stages.fit.initialise import continuous, torso_orientation
 from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import drop_guesses, observe, visible

@@ -7,7 +7,7 @@ import torch
 
 from pipeline.body import joint_index
 from stages.fit.adam import gradients
-from stages.fit.objective import Objective
+from stages.fit.objective import RegistrationObjective
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.registration import register, views_of
@@ -33,7 +33,7 @@ def prepared(model, count, gap=1):
     sizes = (3, small.expression.shape[2], 0)
     initial = parameters_of(rotation, clip.poses.transl, sizes)
     movable = movable_joints(small, observed.mask.any(0), observed.vague)
-    objective = Objective(body, observed, small, views, initial, movable, FitSettings())
+    objective = RegistrationObjective(body, observed, small, views, initial, movable, FitSettings())
     moved = parameters_of(rotation + 0.02, clip.poses.transl + 0.01, sizes)
     return objective, moved
 

@@ -20,9 +20,9 @@ from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, read_split
 from pipeline.errors import UserError
-from pipeline.pose_files import RECORD, read_record, with_flat_hands
-from stages.fit.initial_poses import keep_given
-from stages.fit.views import stack
+from pipeline.pose_files import INITIAL_POSES, read_initial_poses, with_flat_hands
+from stages.fit.camera_batch import stack
+from stages.fit.initialise_from_poses import keep_given
 from stages.ingest.datasets.neuman import official_split
 from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
@@ -63,7 +63,7 @@ def check_body(output: Path, shown, rows: dict[int, int], pixels: float, place=N
         place: ``transl`` for layouts that have none.
     """
     cameras = read_cameras(output / "cameras.parquet", torch.float64)
-    start = with_flat_hands(read_record(output / RECORD), BODY_FILE, False)
+    start = with_flat_hands(read_initial_poses(output / INITIAL_POSES), BODY_FILE, False)
     if place is not None:
         start = dataclasses.replace(start, transl=torch.from_numpy(place).float())
     start = dataclasses.replace(
@@ -154,7 +154,7 @@ def test_neuman(tmp_path, shown, fitted):
     check_cameras(output, take.rotation, take.translation, take.matrix, range(COUNT))
     split = read_split(output / "split.json")
     assert split.train == (0, 1, 2, 3) and split.test == (5,)  # frame 4 is for validation
-    assert (output / RECORD).exists() == fitted
+    assert (output / INITIAL_POSES).exists() == fitted
     if fitted:
         check_body(output, shown, {0: 0, 3: 3, 5: 5}, 0.05)
 
@@ -238,12 +238,12 @@ def test_talkshow(tmp_path, shown):
     same_pictures(output, shown.still, range(COUNT), exact=False)
     check_cameras(output, shown.still.rotation, shown.still.translation, shown.still.matrix, range(COUNT))
     check_body(output, shown, {0: 0, 3: 3}, 0.3)
-    record = read_record(output / RECORD)
+    record = read_initial_poses(output / INITIAL_POSES)
     assert record.hand_pca.shape == (COUNT, 2, 12) and record.expression.shape == (COUNT, 100)
     alone = ingest(
         tmp_path / "alone", writers.talkshow(tmp_path / "b", shown, False), layout="talkshow", **settings
     )
-    assert not (alone / RECORD).exists()  # without SHOW's .pkl the clip is a clip
+    assert not (alone / INITIAL_POSES).exists()  # without SHOW's .pkl the clip is a clip
 
 
 def test_insta(tmp_path, shown):
@@ -255,16 +255,16 @@ def test_insta(tmp_path, shown):
     heads = [writers.head_camera(shown, row) for row in range(COUNT)]
     check_cameras(output, *(np.stack(part) for part in zip(*heads, strict=True)), take.matrix, frames)
     assert read_split(output / "split.json").test == (5, 6)
-    record = read_record(output / RECORD)
+    record = read_initial_poses(output / INITIAL_POSES)
     truth = shown.poses.rotation[:, 22:25].double().numpy()
     np.testing.assert_allclose(record.rotation[:, 22:25].numpy(), truth, atol=1e-4)
     np.testing.assert_allclose(record.expression[:, 3].numpy(), 0.01 * np.array(frames), atol=1e-6)
     place = np.stack([head[1] - shown.root for head in heads])
     rotation = record.rotation.clone()
     rotation[:, 1:22] = shown.poses.rotation[:, 1:22]  # FLAME knows nothing of the body
-    from pipeline.pose_files import write_record
+    from pipeline.pose_files import write_initial_poses
 
-    write_record(output / RECORD, dataclasses.replace(record, rotation=rotation))
+    write_initial_poses(output / INITIAL_POSES, dataclasses.replace(record, rotation=rotation))
     check_body(output, shown, {1: 0, 4: 3}, 0.1, place)
 
 
@@ -291,7 +291,7 @@ def test_prepared_folder(tmp_path, shown):
         atol=1e-3,
     )
     check_body(output, shown, {0: 0, 3: 3, 5: 5}, 0.05)
-    record = read_record(output / RECORD)
+    record = read_initial_poses(output / INITIAL_POSES)
     assert record.fitted and record.model == shown.body.digest
     views = stack([read_cameras(output / "cameras.parquet")[frame] for frame in every])
     identity, poses = keep_given(with_flat_hands(record, BODY_FILE, False), shown.body, views)

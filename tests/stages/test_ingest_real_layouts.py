@@ -11,7 +11,7 @@ import torch
 from pipeline.clip.keypoints import read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, read_split
 from pipeline.config.request import parse_request
-from pipeline.pose_files import RECORD
+from pipeline.pose_files import INITIAL_POSES
 from pipeline.run.job import open_job
 from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
@@ -97,5 +97,5 @@ def test_oliver_is_a_talkshow_clip_without_shows_file(tmp_path, assets_folder, s
     run(context)
     split = read_split(context.output / "split.json")
     assert len(split.test) == 30 and max(split.train) < min(split.test)
-    assert not (context.output / RECORD).exists()
+    assert not (context.output / INITIAL_POSES).exists()
     assert read_footage(context.output / "footage.json").sources["masks"] == "mediapipe"

@@ -53,6 +53,7 @@ def steps(subject, output, count: int = 3) -> tuple[list[dict[str, float]], dict
     return values, {name: one.grad for name, one in named.items() if one.grad is not None}
 
 
+@pytest.mark.slow
 def test_steps_in_plain_torch_are_those_of_the_kernels(subject, tmp_path, monkeypatch):
     terms, gradients = steps(subject, tmp_path / "kernels")
     without_kernels(monkeypatch)
@@ -89,6 +90,7 @@ def curve_of(output) -> dict[tuple[int, str], float]:
     }
 
 
+@pytest.mark.slow
 def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_path, monkeypatch):
     here = context_for(subject, tmp_path / "here", **ALL_ON)
     stage.run(here)
@@ -107,6 +109,7 @@ def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_
     torch.testing.assert_close(*colors, rtol=0, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_from_elsewhere_is_gone_on_from_on_the_cpu(subject, tmp_path, monkeypatch):
     pretend(monkeypatch)
     original, context = loop.Trainer.step, context_for(subject, tmp_path / "out", **ALL_ON)

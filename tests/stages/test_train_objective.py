@@ -11,7 +11,7 @@ from pipeline.clip.records import Split
 from pipeline.clip.views import ViewCache
 from stages.train.data import TrainingData
 from stages.train.initial_avatar import initial_avatar
-from stages.train.objective import Objective
+from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from tests.stages.train_subject import context_for, data_for, write_subject
@@ -56,14 +56,14 @@ class Scene:
     poses: PoseRefinement
     data: TrainingData
 
-    def objective(self, generated=(), **changes) -> Objective:
+    def objective(self, generated=(), **changes) -> TrainingObjective:
         learnt, data = self.data.clip.split.train, self.data
         made = SaidToBeGenerated(data.crops, tuple(frame for frame in learnt if frame in generated))
         captured = Split(tuple(frame for frame in learnt if frame not in generated), ())
         clip = dataclasses.replace(data.clip, split=captured)
         settings = dataclasses.replace(self.settings, **changes)
         data = dataclasses.replace(data, clip=clip, generated=made)
-        return Objective(self.avatar, self.poses, data, settings, Brightness())
+        return TrainingObjective(self.avatar, self.poses, data, settings, Brightness())
 
 
 def scene(subject, output, **changes) -> Scene:
@@ -84,7 +84,7 @@ def objective(subject):
     return scene(subject, subject / "gated").objective
 
 
-def gradients(objective: Objective, iterations: range, only: str = "") -> dict[str, torch.Tensor]:
+def gradients(objective: TrainingObjective, iterations: range, only: str = "") -> dict[str, torch.Tensor]:
     """The gradient of each parameter, summed over some iterations at the same weights."""
     modules = {"avatar": objective.avatar, "poses": objective.poses}
     for module in modules.values():
@@ -213,6 +213,6 @@ def test_term_that_lacks_what_it_needs_is_refused(objective):
     made = objective()
     bare = dataclasses.replace(made.data, texture=None)
     with pytest.raises(ValueError, match="texture"):
-        Objective(made.avatar, made.poses, bare, made.settings)
+        TrainingObjective(made.avatar, made.poses, bare, made.settings)
     with pytest.raises(ValueError, match="LPIPS"):
-        Objective(made.avatar, made.poses, made.data, dataclasses.replace(made.settings, lpips=0.2))
+        TrainingObjective(made.avatar, made.poses, made.data, dataclasses.replace(made.settings, lpips=0.2))

@@ -10,8 +10,8 @@ import torch
 from pipeline.body import JOINT_NAMES, Poses, joint_index, rest_joints, write_identity, write_poses
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import Footage, write_cameras, write_footage
-from pipeline.motion.read import Wearer
 from pipeline.pose_files import into_camera, read_hand_mean
+from stages.animate.motions.read import DrivenPerson
 
 FPS = 30.0
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -104,9 +104,9 @@ def write_fitted(root, rotation, way, identity, body, expression=None, turned=No
     return folders
 
 
-def write_capture(path, rotation, way, wearer: Wearer, rename=str):
+def write_capture(path, rotation, way, person: DrivenPerson, rename=str):
     """A BVH in centimetres whose joints are the body's, by Mixamo's names."""
-    joints, parents = 100 * rest_joints(wearer.body, wearer.identity).double(), wearer.body.parents
+    joints, parents = 100 * rest_joints(person.body, person.identity).double(), person.body.parents
     kept = [joint for joint, name in enumerate(JOINT_NAMES) if name not in ("jaw", "left_eye", "right_eye")]
     lines, columns = ["HIERARCHY"], []
 

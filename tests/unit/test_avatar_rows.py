@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pipeline.avatar.sparse import gather_rows, scatter_rows
+from stages.train.body_regions import unmixed
 from stages.train.frame_visibility_cache import FrameVisibilityCache
-from stages.train.regularisers import unmixed
 from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, body, one_thread  # noqa: F401
 from tests.unit.test_train_losses import PATH
 

@@ -147,21 +147,22 @@ def test_tables_headline_and_files(monkeypatch, capsys, tmp_path, stage, clip):
             )
 
     monkeypatch.setattr(fit, "fit", pretend)
-    monkeypatch.setattr(fit, "_clips", one_clip)
+    monkeypatch.setattr(fit, "clips_of", one_clip)
     table, figure = tmp_path / "fit.json", tmp_path / "fit.png"
     fit.main(["--quick", "--json", str(table), "--figure", str(figure)])
     lines = capsys.readouterr().out.splitlines()
-    assert sum(line.strip().startswith("no mask ") for line in lines) == 3
+    assert sum("| no mask " in line for line in lines) == 3
     assert "upper 2.00 and 3.00" in lines[-1] and lines[-1].startswith("fit: ")
     record = json.loads(table.read_text())
     assert len(record["errors"]) == 3 * len(fit.VARIANTS)
-    assert {run["iterations"] for run in record["effort"]} == set(fit.QUICK_EFFORTS)
+    assert all(len(row["runs"]) == 1 for row in record["errors"])
+    assert {row["iterations"] for row in record["effort"]} == set(fit.QUICK_EFFORTS)
     assert figure.read_bytes().startswith(b"\x89PNG")
 
     few = ["--quick", "--framings", "upper", "--variants", fit.MASKED, "tau = 0", "--no-effort"]
     fit.main([*few, "--json", str(table)])
     record = json.loads(table.read_text())
-    assert [(run["framing"], run["variant"]) for run in record["errors"]] == [
+    assert [(row["framing"], row["variant"]) for row in record["errors"]] == [
         ("upper", fit.MASKED), ("upper", "tau = 0")
     ]  # fmt: skip
-    assert not record["effort"] and "upper 2.00 and nan" in capsys.readouterr().out
+    assert "effort" not in record and "upper 2.00 and nan" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from pipeline.avatar import head as heads
 from pipeline.avatar.head import Head
 from pipeline.avatar.skinning_tables import plain_normals, plain_place
 from pipeline.body import Pose, joint_transforms, load_body, mean_identity
-from pipeline.device import moved, resolve
+from pipeline.device import autocast, moved, product_dtype, resolve
 from pipeline.errors import UserError
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
 
@@ -98,6 +98,22 @@ def test_a_head_in_plain_torch_is_the_fused_one_with_gradients(monkeypatch, half
         results.append([output.detach(), points.grad, *(one.grad for one in head.parameters())])
     for fused, plain in zip(*results, strict=True):
         assert (fused - plain).norm() <= tolerance * fused.norm()
+
+
+def test_heads_are_multiplied_in_bfloat16_where_it_is_allowed_and_pays(monkeypatch):
+    cpu = torch.device("cpu")
+    for capability, dtype in (
+        ("AVX512", torch.bfloat16),
+        ("AVX2", torch.float32),
+        ("DEFAULT", torch.float32),
+    ):
+        monkeypatch.setattr(
+            torch.backends.cpu, "get_cpu_capability", lambda capability=capability: capability
+        )
+        assert product_dtype(cpu, True) == dtype and product_dtype(cpu, False) == torch.float32
+        with autocast(cpu, True):
+            assert torch.is_autocast_enabled("cpu") == (dtype == torch.bfloat16)
+    assert product_dtype(torch.device("cuda"), True) == torch.bfloat16
 
 
 def test_an_avatar_moves_there_and_back(avatar):

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from pipeline.body import joint_index, posed_joints
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
-from pipeline.pose_files import read_hand_mean, read_initial_poses
-from pipeline.pose_files.axes import into_camera, into_world, moved_pivot
+from pipeline.pose_files import into_camera, into_world, moved_pivot, read_hand_mean, read_smplx_json
 from tests.unit.fake_body import PARENTS, write_official
 
 FLAT = torch.zeros(30, 3)
@@ -51,7 +50,7 @@ def write(folder, frames):
 
 def test_every_number_finds_its_joint(tmp_path):
     value = parameters(seed=3)
-    start = read_initial_poses(write(tmp_path / "init", {7: value}), [7], FLAT)
+    start = read_smplx_json(write(tmp_path / "init", {7: value}), [7], FLAT)
     rotation = start.rotation[0].tolist()
     for key, joint in (
         ("root_pose", "pelvis"),
@@ -75,7 +74,7 @@ def test_every_number_finds_its_joint(tmp_path):
 def test_hands_are_relative_to_the_models_mean(tmp_path):
     folder = write(tmp_path / "init", {0: parameters()})
     mean = draw(30, 3).float()
-    flat, bent = (read_initial_poses(folder, [0], hand).rotation[0] for hand in (FLAT, mean))
+    flat, bent = (read_smplx_json(folder, [0], hand).rotation[0] for hand in (FLAT, mean))
     torch.testing.assert_close(bent[25:] - flat[25:], mean)
     assert torch.equal(bent[:25], flat[:25])
 
@@ -86,13 +85,13 @@ def test_flat_lists_leading_zeros_and_other_files_are_fine(tmp_path):
     write(folder, {"shape_param": [0.0] * 10, "notes": "no json at all"})
     nested = write(tmp_path / "nested", {5: value})
     assert torch.equal(
-        read_initial_poses(folder, [5], FLAT).rotation, read_initial_poses(nested, [5], FLAT).rotation
+        read_smplx_json(folder, [5], FLAT).rotation, read_smplx_json(nested, [5], FLAT).rotation
     )
 
 
 def test_what_is_missing_is_zero_or_none(tmp_path):
     value = {"root_pose": [0.0, 0.1, 0.0], "body_pose": [[0.0] * 3] * 21, "trans": [0.1, 0.2, 3.0]}
-    start = read_initial_poses(write(tmp_path / "init", {1: value}), [1], FLAT)
+    start = read_smplx_json(write(tmp_path / "init", {1: value}), [1], FLAT)
     assert not start.rotation[:, 1:].any() and start.betas is None and start.expression is None
     assert start.transl.tolist() == [pytest.approx([0.1, 0.2, 3.0])]
 
@@ -109,7 +108,7 @@ def test_frames_without_a_pose_are_turned_between_their_neighbours(tmp_path, hol
     }
     folder = write(tmp_path / "init", ends | ({} if hole is None else {4: empty[hole]}))
     notes = []
-    start = read_initial_poses(folder, [1, 2, 4, 10, 12], FLAT, notes.append)
+    start = read_smplx_json(folder, [1, 2, 4, 10, 12], FLAT, notes.append)
     assert start.valid.tolist() == [False, True, False, True, False]
     assert len(notes) == 1 and "3 of 5 frames" in notes[0] and str(folder) in notes[0]
     angle = start.rotation[2, 0].double() @ torch.tensor([1.0, 0, 0]).double() % (2 * math.pi)
@@ -123,7 +122,7 @@ def test_frames_without_a_pose_are_turned_between_their_neighbours(tmp_path, hol
 @given(seed=st.integers(0, 2**31), share=st.integers(1, 9))
 def test_interpolated_rotations_lie_on_the_shortest_arc(tmp_path, seed, share):
     ends = {f: parameters(seed + f) for f in (0, 10)}
-    start = read_initial_poses(write(tmp_path / "init", ends), [0, share, 10], FLAT)
+    start = read_smplx_json(write(tmp_path / "init", ends), [0, share, 10], FLAT)
     matrices = roma.rotvec_to_rotmat(start.rotation.double())
     whole, part, rest = (
         roma.rotmat_geodesic_distance(matrices[a], matrices[b]) for a, b in ((0, 2), (0, 1), (1, 2))
@@ -168,7 +167,7 @@ def test_malformed_files_are_named_in_one_line(tmp_path, value):
     text = value if isinstance(value, str) else json.dumps(value)
     (folder / "2.json").write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(UserError, match=r"2\.json.*fit\.pose_init") as caught:
-        read_initial_poses(folder, [1, 2], FLAT)
+        read_smplx_json(folder, [1, 2], FLAT)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
 
 
@@ -184,7 +183,7 @@ JUNK = st.recursive(
 def test_any_junk_is_an_empty_frame_or_one_clear_error(tmp_path, name, junk):
     folder = write(tmp_path / "init", {1: parameters(), 2: parameters(**{name: junk})})
     try:
-        start = read_initial_poses(folder, [1, 2], FLAT)
+        start = read_smplx_json(folder, [1, 2], FLAT)
     except UserError as error:
         assert "2.json" in str(error)
     else:
@@ -193,23 +192,23 @@ def test_any_junk_is_an_empty_frame_or_one_clear_error(tmp_path, name, junk):
 
 def test_folders_without_poses_of_the_clip_are_named(tmp_path):
     with pytest.raises(UserError, match="nowhere is no folder.*pose_init"):
-        read_initial_poses(tmp_path / "nowhere", [1], FLAT)
+        read_smplx_json(tmp_path / "nowhere", [1], FLAT)
     folder = write(tmp_path / "init", {8: parameters(), 9: parameters(root_pose=None)})
     for frames, found in (
         ([1, 2], "poses of 0 of the clip's 2 frames"),
         ([9], "poses of 1 of the clip's 1 frames"),
     ):
         with pytest.raises(UserError, match=f"init has {found}.*pose_init"):
-            read_initial_poses(folder, frames, FLAT)
+            read_smplx_json(folder, frames, FLAT)
 
 
 def test_two_files_of_a_frame_and_lengths_that_differ_are_errors(tmp_path):
     folder = write(tmp_path / "init", {1: parameters(), 2: parameters(expr=[0.0] * 50)})
     with pytest.raises(UserError, match=r"2\.json has 50 numbers in expr, 1\.json 10"):
-        read_initial_poses(folder, [1, 2], FLAT)
+        read_smplx_json(folder, [1, 2], FLAT)
     write(folder, {"01": parameters()})
     with pytest.raises(UserError, match=r"of one frame"):
-        read_initial_poses(folder, [1], FLAT)
+        read_smplx_json(folder, [1], FLAT)
 
 
 def test_the_hand_mean_of_a_body_file(tmp_path):

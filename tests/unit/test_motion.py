@@ -19,14 +19,11 @@ from pipeline.body import (
 )
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from pipeline.motion.fitted_motion import READ
-from pipeline.motion.legs import leg_of
-from pipeline.motion.motion import Motion, Span
-from pipeline.motion.motion_name import motion_name
-from pipeline.motion.placement import place
-from pipeline.motion.read import Wearer, read_motion, with_relaxed_hands
 from pipeline.pose_files import read_hand_mean
-from stages.animate import LENT
+from stages.animate.motions.motion import Motion, Span, leg_length
+from stages.animate.motions.placement import place
+from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_hands
+from stages.animate.motions.source import motion_source
 from tests.unit.motion_files import (
     FPS,
     made_up,
@@ -47,13 +44,13 @@ def body():
 
 
 @pytest.fixture(scope="module")
-def wearer(body):
-    return Wearer(body, BODY_FILE, mean_identity(body))
+def person(body):
+    return DrivenPerson(body, BODY_FILE, mean_identity(body))
 
 
 @pytest.fixture(scope="module")
-def pivot(wearer):
-    return rest_joints(wearer.body, wearer.identity)[0].double()
+def pivot(person):
+    return rest_joints(person.body, person.identity)[0].double()
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +58,8 @@ def truth():
     return made_up(COUNT)
 
 
-def read(path, wearer, span=None, up="auto", folders=None):
-    return read_motion(motion_name(str(path)), wearer, span or Span(), up, folders or {})
+def read(path, person, span=None, up="auto", folders=None):
+    return read_motion(motion_source(str(path)), person, span or Span(), up, folders or {})
 
 
 def angle(a, b):
@@ -70,10 +67,10 @@ def angle(a, b):
     return roma.rotmat_geodesic_distance(roma.rotvec_to_rotmat(a.double()), roma.rotvec_to_rotmat(b.double()))
 
 
-def check(motion, truth, wearer, joints=slice(None), most=1e-3):
+def check(motion, truth, person, joints=slice(None), most=1e-3):
     """The motion is the truth, once it is placed: rotations, way, and the ground."""
     rotation, way = truth
-    placed = place(motion, wearer.body, wearer.identity)
+    placed = place(motion, person.body, person.identity)
     assert motion.fps == pytest.approx(FPS) and len(placed) == len(way)
     assert float(angle(placed.rotation, rotation)[:, joints].max()) < most
     moved = placed.transl - placed.transl[:1]
@@ -91,52 +88,48 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_tells_the_same_motion(tmp_path, form, truth, pivot, wearer):
-    motion = read(FORMS[form](tmp_path, truth, pivot), wearer)
-    check(motion, truth, wearer)
+def test_every_form_tells_the_same_motion(tmp_path, form, truth, pivot, person):
+    motion = read(FORMS[form](tmp_path, truth, pivot), person)
+    check(motion, truth, person)
     untold = {"amass": 3, "parts": 2}.get(form, 0)  # jaw and eyes, or eyes
     assert len(JOINT_NAMES) - len(motion.told) == untold
     assert motion.expression is None  # these coefficients are another body's
 
 
-def test_a_capture_tells_the_same_motion(tmp_path, truth, wearer):
+def test_a_capture_tells_the_same_motion(tmp_path, truth, person):
     rotation, way = truth
-    path = write_capture(tmp_path / "walk.bvh", rotation, way, wearer)
+    path = write_capture(tmp_path / "walk.bvh", rotation, way, person)
     limbs = [joint for joint in range(25) if JOINT_NAMES[joint] not in ("jaw", "left_eye", "right_eye")]
-    motion = read(path, wearer)
-    check(motion, truth, wearer, limbs, most=0.01)
-    check(motion, truth, wearer, most=0.06)  # the hands' orientation is found from their knuckles
+    motion = read(path, person)
+    check(motion, truth, person, limbs, most=0.01)
+    check(motion, truth, person, most=0.06)  # the hands' orientation is found from their knuckles
     assert set(JOINT_NAMES) - set(motion.told) == {"jaw", "left_eye", "right_eye"} and not motion.unused
 
 
-def test_what_a_capture_has_besides_is_named(tmp_path, truth, wearer):
+def test_what_a_capture_has_besides_is_named(tmp_path, truth, person):
     names = {"mixamorig:LeftHandRing2": "Tail", "mixamorig:Spine1": "Hump"}
-    path = write_capture(tmp_path / "odd.bvh", *truth, wearer, rename=lambda name: names.get(name, name))
-    motion = read(path, wearer)
+    path = write_capture(tmp_path / "odd.bvh", *truth, person, rename=lambda name: names.get(name, name))
+    motion = read(path, person)
     assert motion.unused == ("Hump", "Tail") or set(motion.unused) == {"Hump", "Tail"}
     assert "left_ring2" not in motion.told and "spine2" not in motion.told
 
 
-def test_another_subjects_clip_in_whatever_world_it_stands(tmp_path, truth, wearer, body):
+def test_another_subjects_clip_in_whatever_world_it_stands(tmp_path, truth, person, body):
     rotation, way = truth
     psi = torch.randn(COUNT, 4, generator=torch.Generator().manual_seed(0))
     tilted = roma.rotvec_to_rotmat(torch.tensor([0.4, 1.9, -0.3], dtype=torch.float64))
     for name, turned in (("plain", None), ("tilted", tilted)):
-        folders = write_fitted(tmp_path / name, rotation, way, wearer.identity, body, psi, turned)
-        motion = read("subject:other", wearer, folders=folders)
-        placed = check(motion, truth, wearer)
+        folders = write_fitted(tmp_path / name, rotation, way, person.identity, body, psi, turned)
+        motion = read("subject:other", person, folders=folders)
+        placed = check(motion, truth, person)
         assert torch.equal(placed.expression[:, :4], psi) and not placed.expression[:, 4:].any()
     assert motion.numbers == tuple(range(0, 2 * COUNT, 2))
 
 
-def test_what_the_stage_lends_is_what_is_read():
-    assert LENT == READ
-
-
-def test_gaps_between_a_folders_frames_come_from_the_neighbours(tmp_path, truth, pivot, wearer):
+def test_gaps_between_a_folders_frames_come_from_the_neighbours(tmp_path, truth, pivot, person):
     folder = write_folder(tmp_path / "smplx_init", *truth, pivot, BODY_FILE)
     (folder / "6.json").unlink()
-    motion = read(folder, wearer)
+    motion = read(folder, person)
     assert motion.numbers == tuple(range(4, 4 + COUNT)) and any(
         "interpolated" in note for note in motion.notes
     )
@@ -176,25 +169,25 @@ def longer_legs(body, share):
     return dataclasses.replace(identity, joint_offset=offset)
 
 
-def test_longer_legs_walk_farther_and_turn_as_much(truth, body, wearer):
+def test_longer_legs_walk_farther_and_turn_as_much(truth, body, person):
     rotation, way = truth
     motion = Motion(
-        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_of(body), JOINT_NAMES
+        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_length(body), JOINT_NAMES
     )
     tall = longer_legs(body, 1.3)
-    short, long = place(motion, body, wearer.identity), place(motion, body, tall)
+    short, long = place(motion, body, person.identity), place(motion, body, tall)
     assert long.scale == pytest.approx(1.3, rel=1e-3) and short.scale == pytest.approx(1)
     assert torch.equal(long.rotation, short.rotation)
     moved = [(one.transl - one.transl[:1]).double() for one in (short, long)]
     assert torch.allclose(moved[0], way, atol=1e-5) and torch.allclose(moved[1], 1.3 * way, atol=1e-3)
 
 
-def test_the_feet_are_on_the_ground_and_the_pelvis_above_the_origin(truth, body, wearer):
+def test_the_feet_are_on_the_ground_and_the_pelvis_above_the_origin(truth, body, person):
     rotation, way = truth
     motion = Motion(
-        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_of(body), JOINT_NAMES
+        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_length(body), JOINT_NAMES
     )
-    for identity in (wearer.identity, longer_legs(body, 1.3)):
+    for identity in (person.identity, longer_legs(body, 1.3)):
         placed = place(motion, body, identity)
         feet = body.skinning_weights[:, [7, 8, 10, 11]].sum(1) > 0.5
         vertices, _ = pose_body(body, identity, placed.rotation, placed.expression, placed.transl)
@@ -203,28 +196,30 @@ def test_the_feet_are_on_the_ground_and_the_pelvis_above_the_origin(truth, body,
         assert pelvis[[0, 2]].abs().max() < 1e-6 and 0.5 < pelvis[1] < 1.5
 
 
-def test_a_walk_on_the_spot_keeps_its_turns(truth, body, wearer):
+def test_a_walk_on_the_spot_keeps_its_turns(truth, body, person):
     rotation, way = truth
     motion = Motion(
-        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_of(body), JOINT_NAMES
+        "walk", FPS, tuple(range(COUNT)), rotation.float(), None, way.float(), leg_length(body), JOINT_NAMES
     )
-    still = place(motion, body, wearer.identity, in_place=True)
+    still = place(motion, body, person.identity, in_place=True)
     assert torch.allclose(still.transl, still.transl[:1].expand_as(still.transl))
-    assert torch.equal(still.rotation, place(motion, body, wearer.identity).rotation)
+    assert torch.equal(still.rotation, place(motion, body, person.identity).rotation)
 
 
-def test_front_is_where_the_first_frame_looks_unless_a_camera_says(truth, body, wearer):
+def test_front_is_where_the_first_frame_looks_unless_a_camera_says(truth, body, person):
     rotation, way = truth
     turn = roma.rotvec_to_rotmat(torch.tensor([0.0, 2.0, 0.0]))
     turned = rotation.float().clone()
     turned[:, 0] = roma.rotmat_to_rotvec(turn @ roma.rotvec_to_rotmat(turned[:, 0]))
-    motion = Motion("walk", FPS, (0,) * COUNT, turned, None, way.float() @ turn.mT, leg_of(body), JOINT_NAMES)
-    check(motion, truth, wearer)
-    filmed = place(dataclasses.replace(motion, faces_camera=True), body, wearer.identity)
+    motion = Motion(
+        "walk", FPS, (0,) * COUNT, turned, None, way.float() @ turn.mT, leg_length(body), JOINT_NAMES
+    )
+    check(motion, truth, person)
+    filmed = place(dataclasses.replace(motion, faces_camera=True), body, person.identity)
     assert torch.equal(filmed.rotation, turned)
 
 
-def test_hands_that_nobody_captured_hang_relaxed(truth, wearer):
+def test_hands_that_nobody_captured_hang_relaxed(truth, person):
     rotation, way = truth
     told = tuple(name for name in JOINT_NAMES if not name.startswith("left_thumb"))
     motion = Motion("walk", FPS, (0,) * COUNT, rotation.float(), None, way.float(), 0.8, told)
@@ -241,10 +236,10 @@ class Evil:
         return (print, ("executed",))
 
 
-def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth, pivot, wearer, capsys):
+def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth, pivot, person, capsys):
     def refused(path, *words):
         with pytest.raises(UserError) as error:
-            read(path, wearer)
+            read(path, person)
         assert all(word in str(error.value) for word in (str(path), *words)), error.value
 
     refused(tmp_path / "none.bvh", "no such file", "subject:NAME")
@@ -253,7 +248,7 @@ def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth,
     np.savez(tmp_path / "objects.npz", poses=np.array([Evil()], object))
     refused(tmp_path / "objects.npz")
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Evil()))
-    refused(tmp_path / "pickle.npz", "no readable npz")
+    refused(tmp_path / "pickle.npz", "npz archive")
     np.savez(tmp_path / "lacks.npz", trans=np.zeros((3, 3)))
     refused(tmp_path / "lacks.npz", "root_orient", "AMASS")
     np.savez(tmp_path / "odd.npz", poses=np.zeros((3, 100)))
@@ -264,7 +259,7 @@ def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth,
     refused(tmp_path / "empty.npz", "no frames")
     write_npz(tmp_path / "slow.npz", *truth, pivot, mocap_framerate=np.array(-3.0))
     refused(tmp_path / "slow.npz", "frames a second")
-    write_capture(tmp_path / "dog.bvh", *truth, wearer, rename=lambda name: name.replace("Arm", "Paw"))
+    write_capture(tmp_path / "dog.bvh", *truth, person, rename=lambda name: name.replace("Arm", "Paw"))
     refused(tmp_path / "dog.bvh", "left_elbow", "mixamorig:Hips", "Mixamo")
     for name, text in (
         ("cut", "HIERARCHY ROOT Hips { CHANNELS 99999999"),
@@ -277,21 +272,21 @@ def test_wrong_files_are_named_with_a_remedy_and_never_executed(tmp_path, truth,
     assert "executed" not in capsys.readouterr().out
 
 
-def test_a_far_numbered_frame_does_not_fill_the_memory(tmp_path, truth, pivot, wearer):
+def test_a_far_numbered_frame_does_not_fill_the_memory(tmp_path, truth, pivot, person):
     folder = write_folder(tmp_path / "smplx_init", *truth, pivot, BODY_FILE)
     (folder / "4.json").rename(folder / "900000000.json")
     with pytest.raises(UserError, match="900000000"):
-        read(folder, wearer)
+        read(folder, person)
 
 
-def test_a_real_dance_is_carried_over(shared_folder, wearer, body):
+def test_a_real_dance_is_carried_over(shared_folder, person, body):
     path = shared_folder / "data" / "motion" / "jesse_dance.bvh"
     if not path.is_file():
         pytest.skip("there is no motion capture here")
-    motion = read(path, wearer, Span(0, 300))
+    motion = read(path, person, Span(0, 300))
     assert motion.fps == pytest.approx(100 / 3) and len(motion) == 101
     assert "LeftInHandIndex" in motion.unused and "left_index2" in motion.told
-    placed = place(motion, body, wearer.identity)
-    joints = posed_joints(placed.rotation, rest_joints(body, wearer.identity), body.parents)
+    placed = place(motion, body, person.identity)
+    joints = posed_joints(placed.rotation, rest_joints(body, person.identity), body.parents)
     height = joints[:, joint_index("head"), 1] + placed.transl[:, 1]
     assert 1.4 < float(height.min()) and float(height.max()) < 1.9  # she hops

@@ -201,10 +201,11 @@ def test_kernels_are_compiled_once_for_all_processes():
     program = (
         "import torch\n"
         "from tests.unit.splat_scene import draw, scene\n"
-        "from pipeline.splat import blend, project, tiles\n"
+        "from pipeline.splat import blending, projection, tiles\n"
         "draw(*scene(3, 8, 8, torch.float32), 'numba')\n"
-        "kernels = (blend.blend_forward, blend.blend_backward, blend.sum_weights, project.project_forward,\n"
-        "           project.project_backward, tiles.bin_gaussians)\n"
+        "kernels = (blending.blend_forward, blending.blend_backward, blending.sum_weights,\n"
+        "           projection.project_forward,\n"
+        "           projection.project_backward, tiles.bin_gaussians)\n"
         "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -32,7 +32,7 @@ from pipeline.studies.ablation import (
     write_ablation,
 )
 from pipeline.studies.fit_error import aligned_error
-from pipeline.studies.plots import bars, curves, scatter
+from pipeline.studies.plots import bars, curves, round_ticks, scatter
 from pipeline.studies.sweep import CHANCE as CHANCE_PARAMETER
 from pipeline.studies.sweep import Level, label_of
 from pipeline.studies.tables import LATEX, MAIN, NOTE, Table, latex, markdown
@@ -304,6 +304,13 @@ def test_plots_of_next_to_nothing(tmp_path):
     bars(tmp_path / "d.png", pd.Series({"a": 0.0, "b": math.nan}), "dB", 0.1, True)
     curves(tmp_path / "e.png", {}, "s", "dB")
     assert all(cv2.imread(str(tmp_path / f"{name}.png")) is not None for name in "abcde")
+
+
+@given(st.floats(1e-3, 1e5), st.floats(1.3, 1e5))
+def test_a_logarithmic_axis_has_ticks_enough_to_read_it(low, ratio):
+    ticks = round_ticks(low, low * ratio)
+    assert 2 <= len(ticks) <= 13 and ticks == sorted(ticks)
+    assert low <= ticks[0] and ticks[-1] <= low * ratio
 
 
 def test_equal_plots_have_equal_bytes(tmp_path):

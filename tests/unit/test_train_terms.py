@@ -11,7 +11,7 @@ from pipeline.body import load_body, mean_identity
 from pipeline.clip.camera import facing_camera
 from pipeline.config.settings import Weight
 from pipeline.config.workspace import REPOSITORY
-from stages.train import STAGE, losses, objective, regularisers
+from stages.train import STAGE, body_regions, losses, objective
 from stages.train.face import Pasted, face_triangles, paste
 from stages.train.losses import person_crop
 from stages.train.settings import TrainSettings
@@ -138,7 +138,7 @@ def test_weights_follow_the_parts(canonical):
     settings = TrainSettings(offset=1.0, offset_hands=2.0, offset_face=3.0, laplacian_color_hands=4.0)
     terms = {term.name: term for term in objective.TERMS}
     weights = {
-        name: regularisers.weight_by_part(canonical, *terms[name].part_weights(settings))
+        name: body_regions.weight_by_part(canonical, *terms[name].part_weights(settings))
         for name in ("offset", "laplacian_color")
     }
     hands, face = canonical.is_part("left_hand", "right_hand"), canonical.is_part("face")
@@ -146,11 +146,11 @@ def test_weights_follow_the_parts(canonical):
     assert set(weights["offset"][face].flatten().tolist()) == {3.0}
     assert set(weights["offset"][~hands & ~face].flatten().tolist()) == {1.0}
     assert set(weights["laplacian_color"][hands].flatten().tolist()) == {4.0}
-    assert regularisers.find_regions(canonical, {}, arms=False).undersides is None
+    assert body_regions.find_regions(canonical, {}, arms=False).undersides is None
 
 
 def test_undersides_lie_below_what_they_are_paired_with(canonical):
-    found = regularisers.find_undersides(canonical)
+    found = body_regions.find_undersides(canonical)
     matrix = found.above.matrix.to_dense()
     torch.testing.assert_close(matrix.sum(1), torch.ones(len(found.rows)))
     up = canonical.frames[:, 1, 2]

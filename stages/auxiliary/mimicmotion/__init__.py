@@ -4,9 +4,7 @@ No weights are to be had where this was written: shapes, tiling, blending, deter
 tested with tiny random weights, and no real ones were ever run.
 """
 
-from stages.auxiliary.mimicmotion.denoising import animate
-from stages.auxiliary.mimicmotion.model import Model, load_model
-from stages.auxiliary.mimicmotion.pose_net import PoseNet
-from stages.auxiliary.mimicmotion.tiles import tile_weights, tiles
+from stages.auxiliary.mimicmotion.denoising import animate, tile_weights, tiles
+from stages.auxiliary.mimicmotion.model import Model, PoseNet, load_model
 
 __all__ = ["Model", "PoseNet", "animate", "load_model", "tile_weights", "tiles"]

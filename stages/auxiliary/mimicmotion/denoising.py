@@ -1,4 +1,4 @@
-"""Denoising the turn: one long latent video, tile by tile at every step."""
+"""Denoising the turn: one long latent video, tile by tile at every step, overlaps blended."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from torch import Tensor
 from pipeline.errors import UserError
 from stages.auxiliary.folder import numbered, read_color
 from stages.auxiliary.mimicmotion.model import Model, load_model
-from stages.auxiliary.mimicmotion.tiles import tile_weights, tiles
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -25,7 +24,7 @@ CHUNK = 8  # frames that are decoded together
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
-    """How the video is denoised: MimicMotion 1.1's numbers are the stage's defaults."""
+    """Settings of the denoising: MimicMotion 1.1's numbers are the stage's defaults."""
 
     steps: int
     guidance: float
@@ -69,7 +68,6 @@ def denoise(
     """The latent video, frame 0 of which shows the reference's pose.
 
     Args:
-        model: the networks.
         reference: the person, in [-1, 1].
         poses: F skeletons [H, W, 3] uint8, the reference's own first.
         sampling: steps, guidance, tiles, seed.
@@ -141,3 +139,33 @@ def _device(name: str) -> torch.device:
     if name != "auto":
         return torch.device(name)
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def tiles(frames: int, size: int, overlap: int) -> list[list[int]]:
+    """Frame numbers of each tile.
+
+    Frame 0 shows the reference's own pose and leads every tile, so that each knows whom it shows; the
+    others follow one another. Two neighbours have ``overlap`` frames in common, frame 0 among them, and the
+    last two as many as it takes to end at the last frame.
+
+    Args:
+        frames: of the video, frame 0 included.
+        size: frames of a tile; a shorter video is one tile.
+        overlap: at least 1 and less than ``size - 1``.
+
+    Raises:
+        ValueError: the overlap leaves no way forward.
+    """
+    if frames <= size:
+        return [list(range(frames))]
+    if not 1 <= overlap < size - 1:
+        raise ValueError(f"an overlap of {overlap} leaves tiles of {size} no way forward")
+    last = frames - size
+    starts = [*range(0, last, size - overlap), last]
+    return [[0, *range(start + 1, start + size)] for start in starts]
+
+
+def tile_weights(size: int) -> Tensor:
+    """The weight of each place in a tile, [size]: a triangle, so that tiles fade into one another."""
+    rising = (torch.arange(size) + 0.5) * 2 / size
+    return torch.minimum(rising, 2 - rising)

@@ -14,16 +14,43 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from pipeline.errors import UserError
-from stages.auxiliary.mimicmotion.pose_net import PoseNet
 
 WEIGHTS = "mimicmotion.safetensors"
 PARTS = ("unet", "vae", "image_encoder", "scheduler")
 _REMEDY = "docs/auxiliary.md says what auxiliary.weights must hold"
 _CLIP_MEAN, _CLIP_DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 _CLIP_SIDE = 224
+_WIDTHS = ((3, 1), (16, 2), (16, 1), (32, 2), (32, 1), (64, 2), (64, 1), (128, 1))
+"""Channels and stride of the eight convolutions; together they divide the picture's sides by 8."""
+
+
+class PoseNet(nn.Module):
+    """Eight convolutions with SiLU, then one of a pixel that starts at zero, times a learnt number.
+
+    At the start of its training nothing is added, so that the video model is what it was.
+    """
+
+    def __init__(self, channels: int = 320):
+        """Args: channels of the UNet's first features."""
+        super().__init__()
+        layers: list[nn.Module] = []
+        before = 3
+        for width, stride in _WIDTHS:
+            kernel = 4 if stride == 2 else 3
+            layers += [nn.Conv2d(before, width, kernel, stride, padding=1), nn.SiLU()]
+            before = width
+        self.conv_layers = nn.Sequential(*layers)
+        self.final_proj = nn.Conv2d(before, channels, 1)
+        nn.init.zeros_(self.final_proj.weight)
+        nn.init.zeros_(self.final_proj.bias)  # type: ignore[arg-type]
+        self.scale = nn.Parameter(torch.full((1,), 2.0))
+
+    def forward(self, poses: Tensor) -> Tensor:
+        """Skeletons [F, 3, H, W] in [-1, 1] -> [F, channels, H / 8, W / 8]."""
+        return self.final_proj(self.conv_layers(poses)) * self.scale
 
 
 @dataclasses.dataclass(frozen=True)

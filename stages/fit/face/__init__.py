@@ -13,14 +13,14 @@ import torch
 from pipeline.body import BodyModel, Landmarks
 from pipeline.clip.keypoints import Keypoints
 from pipeline.numba_kernels import threads
+from stages.fit.camera_batch import CameraBatch
 from stages.fit.face.deca import read_flame_parameters
-from stages.fit.face.flame import face_from_flame
 from stages.fit.face.flame_model import load_flame
-from stages.fit.face.mesh import face_from_mesh
+from stages.fit.face.from_flame import face_from_flame
+from stages.fit.face.from_mesh import face_from_mesh
 from stages.fit.face.target import FaceModel, FaceTarget, face_model, sface
 from stages.fit.observations import Observations
 from stages.fit.settings import FitSettings
-from stages.fit.views import Views
 
 __all__ = ["FaceTarget", "fit_face", "sface"]
 
@@ -32,18 +32,16 @@ def fit_face(
     landmarks: Landmarks,
     keypoints: Keypoints,
     observations: Observations,
-    views: Views,
+    views: CameraBatch,
     settings: FitSettings,
     log: Callable[[str], None] = lambda line: None,
 ) -> FaceTarget | None:
     """Fit a face to the clip by the source that ``settings.face`` names.
 
     Args:
-        body: the body.
         landmarks: where the face mesh lies on it.
         keypoints: the clip's detections; their face mesh is read.
         observations: made of the same keypoints; says which face points to trust.
-        views: the cameras.
         settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh`` where the
             estimator gave a face mesh.
         log: told in one line what was fitted, or why nothing was.
@@ -79,7 +77,7 @@ def fit_face(
 
 
 def _from_mesh(
-    model: FaceModel, keypoints: Keypoints, observations: Observations, views: Views
+    model: FaceModel, keypoints: Keypoints, observations: Observations, views: CameraBatch
 ) -> FaceTarget | None:
     mask = observations.mask[:, observations.of("face")]
     if mask.shape[1] != _MESH_POINTS or not mask.any():

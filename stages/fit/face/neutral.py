@@ -12,7 +12,15 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from stages.fit.face.frames import CHUNK, TOGETHER, Heads, Lens, Sight, linearise, rigidity
+from stages.fit.face.head_poses import (
+    CHUNK,
+    TOGETHER,
+    FaceObservations,
+    HeadPoses,
+    ObservationQuality,
+    linearise,
+    rigidity,
+)
 from stages.fit.face.target import FaceModel, aligned
 
 _SIZE, _REACH = 0.004, 0.025  # metres
@@ -41,7 +49,12 @@ def smooth_modes(model: FaceModel) -> Modes:
 
 
 def solve_neutral(
-    model: FaceModel, modes: Modes, neutral: Tensor, sight: Sight, heads: Heads, lens: Lens
+    model: FaceModel,
+    modes: Modes,
+    neutral: Tensor,
+    observed: FaceObservations,
+    heads: HeadPoses,
+    quality: ObservationQuality,
 ) -> Tensor:
     """The most probable neutral face, given heads, jaws and expressions: [F, 3] -> [F, 3], metres.
 
@@ -50,15 +63,16 @@ def solve_neutral(
 
     Args:
         model: the face; modes: its smooth offsets.
-        neutral: the present neutral face, [F, 3].
-        sight, heads, lens: T frames, as in ``frames.solve``.
+        observed, heads, quality: T frames, as in ``head_poses.solve``.
     """
     count = len(model.mean)
     normal, right = neutral.new_zeros(count, 3, 3), neutral.new_zeros(count, 3)
-    for begin in range(0, len(sight.mask), CHUNK):
+    for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
-        part = Heads(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(Heads)))
-        linear = linearise(model, neutral, sight.frames(rows), part, Lens(lens.noise[rows], lens.gain))
+        part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
+        linear = linearise(
+            model, neutral, observed.frames(rows), part, ObservationQuality(quality.noise[rows], quality.gain)
+        )
         jacobian = linear.camera @ linear.blend
         weighted = jacobian.mT * (TOGETHER * linear.weight)[..., None, None]
         normal += (weighted @ jacobian).sum(0)

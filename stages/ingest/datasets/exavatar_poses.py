@@ -11,8 +11,8 @@
 
 Source: ExAvatar's fitting/ (mks0601/ExAvatar_RELEASE), whose layout FlexiAvatar's release keeps. Roots are
 in the axes of the frame's camera and ``trans`` is relative to the root joint at rest
-(``pipeline.pose_files.axes``); hands are relative to the model's mean. ``locator_offset`` moves supervision
-only and is not read.
+(``pipeline.pose_files.camera_frame``); hands are relative to the model's mean. ``locator_offset`` moves
+supervision only and is not read.
 """
 
 from __future__ import annotations

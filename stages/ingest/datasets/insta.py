@@ -8,10 +8,10 @@
     checkpoint/00012.frame            torch file: flame {exp, jaw, eyes, ...}, opencv {R, t, K}, img_size
 
 Source: INSTA (Zielon/INSTA, scripts/transforms.py), RGBAvatar and FATE. transform_matrix is camera-to-world
-with OpenGL's axes (x right, y up, z towards the viewer), as instant-ngp takes it: columns 1 and 2 change
-sign to become OpenCV's, and the inverse is world-to-camera. The world is the head's own, in metres, so each
-frame has a camera of its own. Where there is no transforms.json, the camera of the .frame files stands
-still and opencv R, t is the head in it.
+with OpenGL's axes (x right, y up, z towards the viewer), as instant-ngp takes it: the second and third
+columns change sign to become OpenCV's, and the inverse is world-to-camera. The world is the head's own, in
+metres, so each frame has a camera of its own. Where there is no transforms.json, the camera of the .frame
+files stands still and opencv R, t is the head in it.
 
 FLAME's numbers start the fit: expression (FLAME's first coefficients are what SMPL-X's expressions are built
 from), and the rotations of jaw and eyes, rotation vectors or the first two ROWS of a matrix (pytorch3d's six

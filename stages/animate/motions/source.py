@@ -1,0 +1,64 @@
+"""The values that ``motion=`` may have. Imports nothing heavy: the DAG asks, too."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from pipeline.errors import UserError
+
+TURNTABLE = "turntable"
+SUBJECT = "subject:"
+KINDS = {".bvh": "bvh", ".npz": "amass"}
+REMEDY = (
+    "a motion is a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, subject:NAME (what another "
+    "subject does in its clip), or turntable"
+)
+
+
+SUBJECT_FILES = {
+    "ingest": ("footage.json", "cameras.parquet"),
+    "fit": ("identity.safetensors", "poses.parquet"),
+}
+"""Stage -> files that are read of a subject whose clip is the motion."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionSource:
+    """The kind and the place of a motion.
+
+    Attributes:
+        kind: ``turntable``, ``subject``, ``bvh``, ``amass`` or ``peers``.
+        path: the file or the folder, of the last three.
+        subject: whose clip, of ``subject``.
+    """
+
+    kind: str
+    path: Path | None = None
+    subject: str = ""
+
+
+def motion_source(text: str) -> MotionSource:
+    """The source that ``motion=`` names; a file's content is checked when it is read.
+
+    Raises:
+        UserError: it is none of the things that a motion may be.
+    """
+    if text == TURNTABLE:
+        return MotionSource(TURNTABLE)
+    if text.startswith(SUBJECT) and len(text) > len(SUBJECT):
+        return MotionSource("subject", subject=text.removeprefix(SUBJECT))
+    path = Path(text)
+    if not text or not path.exists():
+        raise UserError(f"motion={text}: there is no such file; {REMEDY}")
+    if path.is_dir():
+        return MotionSource("peers", path)
+    kind = KINDS.get(path.suffix.lower())
+    if kind is None:
+        raise UserError(f"motion={text}: a {path.suffix or 'file without a suffix'} is no motion; {REMEDY}")
+    return MotionSource(kind, path)
+
+
+def named_subject(text: str) -> str:
+    """The subject whose fit a motion is; empty where it is none."""
+    return text.removeprefix(SUBJECT) if text.startswith(SUBJECT) else ""
