@@ -112,9 +112,10 @@ class Contestant:
         """
         self.name, self.model, self.optimizer, self.shared, self.seen = name, model, optimizer, shared, seen
         self.clock = PartClock(REST, frame.CLOCKS[clock])
-        self.clock.watch("triplane", model.triplane)
-        self.clock.watch("static heads", model.geometry, model.color)
-        self.clock.watch("pose heads", model.pose_geometry, model.pose_color)
+        networks = model.representation if isinstance(model, Avatar) else model
+        self.clock.watch("triplane", networks.triplane)
+        self.clock.watch("static heads", networks.geometry, networks.color)
+        self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
         self._render = self.clock.timed("render", render)
         self._compare = self.clock.timed("losses", photometric)
         self._regularise = self.clock.timed("regularisers", regularisers)

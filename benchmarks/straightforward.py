@@ -88,10 +88,11 @@ class StraightforwardAvatar(nn.Module):
         head = canonical.is_part(*HEAD).long()
         regions = head if len(avatar.boxes) == 2 else torch.zeros_like(head)
         coordinates = normalise(canonical.vertices, regions, avatar.boxes)
-        self.triplane = PlainTriplane(avatar.triplane, coordinates, regions)
-        self.geometry, self.color = PlainHead(avatar.geometry), PlainHead(avatar.color)
-        self.pose_geometry = PlainHead(avatar.pose_geometry)
-        self.pose_color = PlainHead(avatar.pose_color)
+        networks = avatar.representation
+        self.triplane = PlainTriplane(networks.triplane, coordinates, regions)
+        self.geometry, self.color = PlainHead(networks.geometry), PlainHead(networks.color)
+        self.pose_geometry = PlainHead(networks.pose_geometry)
+        self.pose_color = PlainHead(networks.pose_color)
 
     def decode(self) -> Decoded:
         """As ``Avatar.decode``."""
@@ -148,10 +149,11 @@ def matched_gradients(avatar: Avatar, plain: StraightforwardAvatar) -> dict[str,
     Returns:
         name -> (the avatar's, the straightforward one's), of equal shape.
     """
-    assert avatar.triplane.planes.grad is not None and plain.triplane.planes.grad is not None
-    pairs = {"planes": (avatar.triplane.planes.grad.permute(0, 1, 4, 2, 3), plain.triplane.planes.grad)}
+    planes, networks = avatar.representation.triplane.planes, avatar.representation
+    assert planes.grad is not None and plain.triplane.planes.grad is not None
+    pairs = {"planes": (planes.grad.permute(0, 1, 4, 2, 3), plain.triplane.planes.grad)}
     for name in ("geometry", "color", "pose_geometry", "pose_color"):
-        ours, theirs = getattr(avatar, name), getattr(plain, name)
+        ours, theirs = getattr(networks, name), getattr(plain, name)
         layers = [layer for layer in theirs.layers if not isinstance(layer, nn.ReLU)]
         assert ours.first.weight.grad is not None
         first = ours.first.weight.grad

@@ -25,6 +25,8 @@ class Architecture:
         residual_moves: whether they move Gaussians, too: the ablation of the paper's supplement E.3.
         place_frequencies, time_frequencies: of the encodings of that place and of the time.
         pose_heads: whether there are any; one who never moves needs none.
+        representation: ``"triplane"`` or ``"bases"``; the sizes of planes and heads are the triplane's.
+        bases: K, of the bases.
     """
 
     plane_resolution: int = 128
@@ -44,3 +46,5 @@ class Architecture:
     time_frequencies: int = 6
     pose_heads: bool = True
     residual_moves: bool = False
+    representation: str = "triplane"
+    bases: int = 0

@@ -1,9 +1,9 @@
-"""The canonical triplane avatar, and its Gaussians in a pose (the paper's Sections 3.3, 3.5 and 3.6).
+"""The canonical avatar, and its Gaussians in a pose (the paper's Sections 3.3, 3.5 and 3.6).
 
-Data flows: triplane features ``f_i`` -> static heads (offset, scale, colour) + pose heads + residual
-colours of face and hands -> plus expression -> linear blend skinning -> Gaussians. The part before
-the pose is the same for every frame: ``decode`` once, ``pose`` as often as needed; a finished avatar
-does so by itself.
+Data flows: the representation's static part (offset, scale, colour) + what follows pose and face -> plus
+expression -> linear blend skinning -> Gaussians. The representation (``representation.py``) is the paper's
+triplane with its heads, or linear bases. The part before the pose is the same for every frame: ``decode``
+once, ``pose`` as often as needed; a finished avatar does so by itself.
 """
 
 from __future__ import annotations
@@ -15,38 +15,19 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.architecture import Architecture
+from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.avatar.canonical import Canonical, build_canonical
-from pipeline.avatar.head import Head
-from pipeline.avatar.residual import Residuals, regions
+from pipeline.avatar.representation import Condition, Decoded, Representation
+from pipeline.avatar.residual import regions
 from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
-from pipeline.avatar.sparse import gather_rows, scatter_rows
 from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
-from pipeline.avatar.triplane import Triplane
+from pipeline.avatar.triplane_representation import TriplaneRepresentation
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
-from pipeline.device import autocast, moved
+from pipeline.device import moved
 from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
 LARGEST_SCALE = 0.03  # metres
-
-
-@dataclasses.dataclass(frozen=True)
-class Decoded:
-    """The part of an avatar that does not depend on the pose.
-
-    Attributes:
-        surface: the level that was decoded.
-        features: [N, 3 C], ``f_i``.
-        offset: [N, 3], Delta V_tri, metres.
-        log_scale: [N, 3], S_tri, relative to the initial scale.
-        color_logit: [N, 3], C_tri, before the sigmoid.
-    """
-
-    surface: Surface
-    features: Tensor
-    offset: Tensor
-    log_scale: Tensor
-    color_logit: Tensor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +36,7 @@ class Posed:
 
     Attributes:
         gaussians: in world coordinates.
-        pose_offset: [N, 3], Delta V_pose, metres; None while the pose heads are off.
+        pose_offset: [N, 3], Delta V_pose, metres; None while nothing follows the pose.
         log_scale: [N, 3], S_tri + Delta S_pose.
         color_logit: [N, 3], C_tri + Delta C_pose + Delta C_res.
         color_residual: [N, 3], Delta C_res; None while the residual heads are off.
@@ -76,15 +57,16 @@ class Avatar(nn.Module):
 
     Attributes:
         architecture: sizes.
+        representation: what is learnt.
         vertex_ids: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
         identity: the fitted identity; on the CPU, too.
         body_digest: of the body model that it was built on.
         surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
         active: [K] bool, these vertices that the visibility gate leaves; see ``surface``.
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
-        pose_heads_active: whether the pose heads take part.
+        pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
-        base_color: [N, 3] logits on the finest level; what the colour heads add to.
+        base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
     """
 
@@ -131,32 +113,17 @@ class Avatar(nn.Module):
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
         self._restricted: dict[int, tuple[Tensor, Surface]] = {}
-        self._build_networks(seed)
+        self.representation = self._make_representation(seed)
         self._baked: Decoded | None = None
 
-    def _build_networks(self, seed: int) -> None:
-        sizes = self.architecture
-        generator = torch.Generator().manual_seed(seed)
-        self.triplane = Triplane(len(self.boxes), sizes.plane_resolution, sizes.plane_channels, generator)
-        features, pose = self.triplane.features, 6 * (len(self.surfaces[0].canonical.joints) - 1)
-        hidden = {"width": sizes.width, "groups": sizes.groups}
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            self.geometry = Head(features, 6, **hidden)
-            self.color = Head(features, 3, **hidden)
-            if sizes.pose_heads:
-                self.pose_geometry = Head(features, 6, condition=pose, **hidden)
-                self.pose_color = Head(features + 3, 3, condition=pose, **hidden)
-            # Last, so that an avatar with them starts from the same weights as one without.
-            self.residuals = Residuals(
-                tuple(region.part for region in self.surfaces[0].residual),
-                sizes.residual_place,
-                (sizes.place_frequencies, sizes.time_frequencies),
-                pose,
-                sizes.residual_width,
-                sizes.groups,
-                sizes.residual_moves,
-            )
+    def _make_representation(self, seed: int) -> Representation:
+        sizes, canonical = self.architecture, self.surfaces[0].canonical
+        pose = 6 * (len(canonical.joints) - 1)
+        if sizes.representation == "bases":
+            count, expressions = len(self.surfaces[-1].canonical), canonical.expression_directions.shape[-1]
+            return BasesRepresentation(count, sizes.bases, pose, expressions, sizes.offset_unit)
+        parts = tuple(region.part for region in self.surfaces[0].residual)
+        return TriplaneRepresentation(sizes, len(self.boxes), pose, parts, seed, self.half_precision)
 
     def __len__(self) -> int:
         """The number of Gaussians."""
@@ -229,23 +196,10 @@ class Avatar(nn.Module):
         self._baked = None
         return super().train(mode)
 
-    def _autocast(self) -> torch.autocast:
-        return autocast(self.device, self.half_precision)
-
     def decode(self, level: int = -1) -> Decoded:
         """The pose-independent part, on one level of subdivision (the finest by default)."""
         surface = self.surface(level)
-        features = self.triplane(surface.samples)
-        with self._autocast():
-            geometry, color = self.geometry(features), self.color(features)
-        geometry = geometry.float()
-        return Decoded(
-            surface=surface,
-            features=features,
-            offset=geometry[:, :3] * self.architecture.offset_unit,
-            log_scale=geometry[:, 3:],
-            color_logit=surface.pick(self.base_color) + color.float(),
-        )
+        return self.representation.decode(surface, surface.pick(self.base_color))
 
     def pose(
         self,
@@ -263,9 +217,9 @@ class Avatar(nn.Module):
             pose: of the frame.
             noise: added to theta; for training.
             time: seconds from the clip's start, for the residual colours; None where there is no clock.
-            rows: [M] int64, each at most once, the Gaussians that pose and residual heads are evaluated
-                for; all if None.
-            theta: the heads' pose condition, see ``pose_features``; that of ``pose`` if None.
+            rows: [M] int64, each at most once, the Gaussians whose pose-dependent part is asked for; all if
+                None.
+            theta: the pose that the representation is told, see ``pose_features``; that of ``pose`` if None.
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
@@ -274,15 +228,23 @@ class Avatar(nn.Module):
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
+        condition, rest = Condition(theta, pose.expression, time), shape
+        change = None
         if self.pose_heads_active:
-            normals = decoded.surface.skinning_tables.normals(transforms, shape)
-            pose_offset, scale_change, color_change = self._pose_heads(decoded, theta, normals, rows)
-            shape, log_scale = shape + pose_offset, log_scale + scale_change
-            color_logit = color_logit + color_change
+            tables = decoded.surface.skinning_tables
+            change = self.representation.change(
+                decoded, condition, lambda: tables.normals(transforms, rest), rows
+            )
+        if change is not None:
+            pose_offset = change.offset * self.architecture.pose_offset_unit * decoded.surface.pose_movable
+            shape = shape + pose_offset
+            log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
+            color_logit = color_logit + change.color_logit
         means = transform_points(blended, shape) + pose.transl
-        if self.residuals_active and decoded.surface.residual:
-            with self._autocast():
-                answer = self.residuals(decoded.surface.residual, means, theta, time, rows)
+        answer = None
+        if self.residuals_active:
+            answer = self.representation.residual(decoded, means, condition, rows)
+        if answer is not None:
             residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(
@@ -293,22 +255,6 @@ class Avatar(nn.Module):
             opacities=self._opacities(canonical),
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
-
-    def _pose_heads(
-        self, decoded: Decoded, theta: Tensor, normals: Tensor, rows: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        """Delta V_pose [N, 3] metres, Delta S_pose [N, 3], Delta C_pose [N, 3]."""
-        features, count = decoded.features, len(normals)
-        if rows is not None:
-            features, normals = gather_rows(features, rows), gather_rows(normals, rows)
-        with self._autocast():
-            geometry = self.pose_geometry(features, theta)
-            color = self.pose_color(torch.cat([features, normals], 1), theta)
-        geometry, color = geometry.float(), color.float()
-        if rows is not None:
-            geometry, color = scatter_rows(geometry, rows, count), scatter_rows(color, rows, count)
-        offset = geometry[:, :3] * self.architecture.pose_offset_unit * decoded.surface.pose_movable
-        return offset, 0.5 * geometry[:, 3:], color
 
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
         """The centres, moved by what the residual heads say at rest, [N, 3]; as they are for [N, 0]."""
@@ -342,7 +288,7 @@ class Avatar(nn.Module):
             time: seconds from the clip's start, for the residual colours of face and hands. Clamped to
                 the training frames' interval; None, as for a motion that was never filmed, gives what
                 the heads learnt to answer without a clock (see ``residual.py``).
-            theta: the heads' pose condition; that of ``pose`` if None.
+            theta: the pose that the representation is told; that of ``pose`` if None.
         """
         if self._baked is None:
             with torch.no_grad():

@@ -23,13 +23,18 @@ IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 def save_avatar(path: Path, avatar: Avatar) -> None:
     """Writes the avatar; equal avatars give equal bytes.
 
-    The file holds the weights, the identity, and which body vertices are kept and not gated. The body model
-    itself is not in it: ``load_avatar`` needs the one that the avatar was built on.
+    The file holds the weights (in float16 where the representation says so), the identity, and which body
+    vertices are kept and not gated. The body model itself is not in it: ``load_avatar`` needs the one that
+    the avatar was built on.
 
     Raises:
         ValueError: if any number in it is not finite.
     """
-    tensors = {f"network.{name}": tensor for name, tensor in avatar.state_dict().items()}
+    half = avatar.representation.half_stored
+    tensors = {
+        stored: tensor.half() if stored.removeprefix("network.") in half else tensor
+        for stored, tensor in ((_stored_name(name), tensor) for name, tensor in avatar.state_dict().items())
+    }
     for field in IDENTITY_FIELDS:
         tensors[f"identity.{field}"] = torch.as_tensor(getattr(avatar.identity, field))
     for name, tensor in tensors.items():
@@ -50,11 +55,18 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
 
 
+def _stored_name(name: str) -> str:
+    """The name in the file of a tensor of ``Avatar.state_dict``."""
+    return f"network.{name.removeprefix('representation.')}"
+
+
 def _described(architecture: Architecture) -> dict:
     """The sizes as JSON values; what an ablation alone asks for is written only where it was asked for."""
     sizes = dataclasses.asdict(architecture)
     if not architecture.residual_moves:
         del sizes["residual_moves"]
+    if architecture.representation == "triplane":
+        del sizes["representation"], sizes["bases"]
     return sizes
 
 
@@ -87,10 +99,11 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     parts = tuple(header["architecture"]["residual_parts"])  # JSON knows no tuples
     architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
     avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=header["half_precision"])
+    names = {_stored_name(name): name for name in avatar.state_dict()}
     weights = {
-        name.removeprefix("network."): tensor
-        for name, tensor in tensors.items()
-        if name.startswith("network.")
+        names.get(stored, stored): tensor
+        for stored, tensor in tensors.items()
+        if stored.startswith("network.")
     }
     try:
         avatar.load_state_dict(weights)

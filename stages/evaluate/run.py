@@ -72,6 +72,7 @@ from stages.evaluate.upstream import (
     fit_seconds,
     read_gate,
     stage_records,
+    trained_representation,
 )
 from stages.evaluate.verdict import ClipCoverage, verdict
 
@@ -307,9 +308,11 @@ def report_contents(
     plan, refined, gate = decided
     own = StageRecord(STAGE.name, as_dict(settings), seconds, peak_memory(), STAGE.version, "this run")
     registration = read_curve(fit / "curve.parquet", "run the fit stage again")
+    upstream = stage_records(context.inputs)
+    representation = trained_representation(upstream)
     return ReportContents(
         summary=summary,
-        clip=describe_clip(clip),
+        clip=describe_clip(clip, representation),
         cover=cover,
         comparisons=comparisons.slider,
         closeups=comparisons.closeups,
@@ -324,17 +327,18 @@ def report_contents(
         plan=[plan[effect] for effect in EFFECTS],
         gate=gate.why,
         refinement_cost=refinement_cost(context, refined),
-        omissions=omissions(clip.footage, clip.split, settings, table, gate, plan, refined),
-        stages=[*stage_records(context.inputs), own],
+        omissions=omissions(clip.footage, clip.split, settings, table, gate, plan, refined, representation),
+        stages=[*upstream, own],
         versions=versions(),
     )
 
 
-def describe_clip(clip: EvaluatedClip) -> str:
-    """One sentence on where the avatar comes from."""
+def describe_clip(clip: EvaluatedClip, representation: str | None) -> str:
+    """A sentence on where the avatar comes from, and one on what it is made of where that is known."""
     footage = clip.footage
     frames = f"{len(clip.split.train)} frames to learn from and {len(clip.split.test)} held out"
-    return f"Made from {footage.name} ({footage.width} × {footage.height}): {frames}."
+    made = f"Made from {footage.name} ({footage.width} × {footage.height}): {frames}."
+    return made if representation is None else f"{made} Its representation: {representation}."
 
 
 def report_place(output: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,12 @@ def stage_records(inputs: Mapping[str, Path]) -> list[StageRecord]:
         )
         records.append(record)
     return records
+
+
+def trained_representation(records: Sequence[StageRecord]) -> str | None:
+    """The representation that train was asked for, ``triplane`` or ``bases``; None where not recorded."""
+    named = [record.settings.get("representation") for record in records if record.name == "train"]
+    return named[0] if named and isinstance(named[0], str) else None
 
 
 def fit_seconds(fit: Path) -> dict[int, float]:

@@ -49,8 +49,7 @@ class FrameVisibilityCache(nn.Module):
         place = self._places[frame]
         if int(self.levels[place]) != level:
             return None
-        bits = self.bits[place, :, None] >> torch.arange(8, dtype=torch.uint8, device=self.bits.device)
-        visible = (bits & 1).flatten()
+        visible = _unpacked(self.bits[place])
         return torch.nonzero(visible[:count] if kept is None else visible[kept])[:, 0]
 
     def record(self, frame: int, level: int, weights: Tensor, kept: Tensor | None = None) -> None:
@@ -69,3 +68,19 @@ class FrameVisibilityCache(nn.Module):
         powers = torch.tensor([1, 2, 4, 8, 16, 32, 64, 128], dtype=torch.uint8, device=device)
         self.bits[place] = (visible.view(-1, 8) * powers).sum(1, dtype=torch.uint8)
         self.levels[place] = level
+
+    def ever_visible(self, count: int) -> Tensor:
+        """True for Gaussians that any frame showed when it was last drawn, [count] bool.
+
+        Args:
+            count: Gaussians of the finest level, which the frames must have been drawn at.
+        """
+        together = torch.zeros_like(self.bits[0])
+        for bits in self.bits:
+            together |= bits
+        return _unpacked(together)[:count].bool()
+
+
+def _unpacked(bits: Tensor) -> Tensor:
+    """The bits of bytes, the lowest first: [B] uint8 -> [8 B] uint8."""
+    return (bits[:, None] >> torch.arange(8, dtype=torch.uint8, device=bits.device) & 1).flatten()

@@ -19,7 +19,7 @@ from pipeline.splat import render
 from stages.train import schedule
 from stages.train.hooks import Log, describe
 from stages.train.loop import Hook, Trainer
-from stages.train.settings import TrainSettings
+from stages.train.settings import TrainSettings, learning_rates
 from stages.train.timer import TrainingTimer
 
 # dB under the untrained avatar. Rates ten times too high lose 2 of a perfect start, a hundred times 7 to 19.
@@ -74,7 +74,8 @@ class HeldOutCurve(Hook):
             require_progress(self.untrained, now, iteration, settings)
         values = {
             "gaussians": float(len(trainer.avatar.surface(trainer.level).canonical)),
-            "learning_rate": settings.learning_rate * schedule.rate_factor(settings, iteration),
+            "learning_rate": getattr(settings, learning_rates(settings)[0])
+            * schedule.rate_factor(settings, iteration),
         }
         note = ""
         if self._shown:
@@ -121,10 +122,7 @@ def require_progress(untrained: float, now: float, iteration: int, settings: Tra
     """
     if now >= min(untrained - WORSE, SEEN):
         return
-    rates = ", ".join(
-        f"train.{name} (now {getattr(settings, name):g})"
-        for name in ("learning_rate", "plane_learning_rate", "pose_learning_rate")
-    )
+    rates = ", ".join(f"train.{name} (now {getattr(settings, name):g})" for name in learning_rates(settings))
     raise UserError(
         f"training stopped: after {iteration} iterations its pictures are worse than before the first, "
         f"{now:.1f} dB of {untrained:.1f}; try smaller {rates}; the last checkpoint is kept, nothing is "

@@ -8,10 +8,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
+from pipeline.device import moved
 from pipeline.errors import UserError
+from pipeline.finite import require_finite
 from stages.train.data import TrainingData
 from stages.train.initial_colors import initial_color_logits
 from stages.train.poses import PoseRefinement
@@ -30,7 +33,7 @@ def initial_avatar(
     Args:
         data: what it will be learnt from.
         refinement: the fitted poses.
-        settings: with the plan applied.
+        settings: with plan and representation applied.
         log: for a line with the numbers of vertices and Gaussians.
 
     Returns:
@@ -42,11 +45,12 @@ def initial_avatar(
     kept = kept_vertices(data, refinement, settings)
     # What is shown in its base colours in the end belongs to the avatar, though it is never trained.
     rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
-    clip, sizes = data.clip, architecture(settings)
+    clip, conditions = data.clip, clip_conditions(data)
+    sizes = architecture(settings, conditions, clip.body.expression_directions.shape[-1])
     avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, settings.half_precision)
     avatar.to(refinement.poses.rotation.device)
     avatar.pose_heads_active = avatar.residuals_active = False
-    set_time_range(avatar, data)
+    avatar.representation.set_clip(moved(conditions, avatar.device))
     if settings.initial_color or settings.face:
         captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
         logits = initial_color_logits(avatar.eval(), refinement, data, captured, made)
@@ -55,10 +59,9 @@ def initial_avatar(
         if settings.initial_color:
             avatar.base_color.copy_(logits)
     avatar.gate(kept[rows].to(avatar.device))
-    parts = ", ".join(region.part for region in avatar.surface().residual) or "no part"
     log(
         f"{int(kept.sum())} of {len(kept)} body vertices are kept, {len(avatar)} Gaussians; "
-        f"residual colours of: {parts}"
+        f"{described(avatar)}"
     )
     return avatar.train(), data
 
@@ -82,17 +85,48 @@ def kept_vertices(data: TrainingData, refinement: PoseRefinement, settings: Trai
     return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
 
 
-def set_time_range(avatar: Avatar, data: TrainingData) -> None:
-    """Tells the avatar's residual heads when the training frames were filmed."""
-    seconds = data.clip.seconds
-    times = [seconds[frame] for frame in data.clip.split.train if frame in seconds]
-    if times:
-        avatar.residuals.time_range.copy_(torch.tensor([min(times), max(times)]))
+def clip_conditions(data: TrainingData) -> ClipConditions:
+    """The fitted poses, expressions and times of the captured training frames, on the CPU.
+
+    Raises:
+        NotFiniteError: a pose or an expression is not finite; names the frame.
+    """
+    clip = data.clip
+    poses = [clip.pose(frame) for frame in clip.split.train]
+    for frame, pose in zip(clip.split.train, poses, strict=True):
+        told = {"the fitted pose": pose.rotation, "the fitted expression": pose.expression}
+        require_finite(told, "training", f"in frame {frame}", "run the fit stage again")
+    seconds = clip.seconds
+    return ClipConditions(
+        theta=torch.stack([pose_features(pose.rotation) for pose in poses]),
+        expression=torch.stack([pose.expression for pose in poses]),
+        seconds=tuple(seconds[frame] for frame in clip.split.train if frame in seconds),
+    )
 
 
-def architecture(settings: TrainSettings) -> Architecture:
-    """The part of the settings that an avatar's file has to remember."""
-    names = [field.name for field in dataclasses.fields(Architecture) if field.name != "pose_heads"]
+def architecture(settings: TrainSettings, conditions: ClipConditions, expressions: int) -> Architecture:
+    """The part of the settings that an avatar's file has to remember; no more bases than the clip drives.
+
+    Args:
+        settings: with plan and representation applied.
+        conditions: of the training frames.
+        expressions: of the body.
+    """
+    chosen = {"pose_heads", "bases"}
+    names = [field.name for field in dataclasses.fields(Architecture) if field.name not in chosen]
     remembered = {name: getattr(settings, name) for name in names}
     remembered["residual_parts"] = () if settings.residual_from == 1 else settings.residual_parts
-    return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
+    if settings.representation == "triplane":
+        return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
+    remembered |= {"plane_resolution": 2, "plane_channels": 1}  # there are no planes
+    features = signal_features(conditions.theta, conditions.expression, expressions)
+    bases = len(fit_driving_signal(features, settings.bases))
+    return Architecture(**remembered, pose_heads=bases > 0, bases=bases)
+
+
+def described(avatar: Avatar) -> str:
+    """The representation in a few words, for the log."""
+    if avatar.architecture.representation == "bases":
+        return f"bases: {avatar.architecture.bases} driven by pose and face"
+    parts = ", ".join(region.part for region in avatar.surface().residual) or "no part"
+    return f"triplane; residual colours of: {parts}"

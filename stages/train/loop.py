@@ -18,7 +18,7 @@ from stages.train.checkpoint import Checkpoint, gather, restore
 from stages.train.data import TrainingData
 from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
-from stages.train.settings import TrainSettings
+from stages.train.settings import TrainSettings, learning_rates
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
@@ -186,11 +186,13 @@ class Trainer:
         return f"at iteration {self.iteration}, frame{'s' if len(frames) > 1 else ''} {numbers}"
 
     @property
+    def _first_rate(self) -> str:
+        name = learning_rates(self.settings)[0]
+        return f"train.{name} (now {getattr(self.settings, name):g})"
+
+    @property
     def _remedy(self) -> str:
-        return (
-            f"try a smaller train.learning_rate (now {self.settings.learning_rate:g}); the last checkpoint "
-            "is kept, nothing is published"
-        )
+        return f"try a smaller {self._first_rate}; the last checkpoint is kept, nothing is published"
 
     def _modules(self) -> dict[str, torch.nn.Module]:
         """Everything with state, by the prefix that its tensors have in messages and checkpoints."""
@@ -223,12 +225,11 @@ def _optimizers(
     avatar: Avatar, poses: PoseRefinement, settings: TrainSettings
 ) -> tuple[torch.optim.Adam, torch.optim.Adam]:
     """One optimiser for the avatar and one for the poses; ``base_rate`` is what the schedule scales."""
-    planes = list(avatar.triplane.parameters())
-    rest = [parameter for name, parameter in avatar.named_parameters() if not name.startswith("triplane.")]
+    groups = avatar.representation.parameter_groups()
     rate = settings.pose_learning_rate
     angles = [*poses.rotation.parameters(), *poses.expression.parameters()]
     return (
-        _adam([(planes, settings.plane_learning_rate), (rest, settings.learning_rate)]),
+        _adam([(parameters, getattr(settings, name)) for name, parameters in groups.items()]),
         _adam([(angles, rate), (list(poses.transl.parameters()), rate * TRANSL_RATE)]),
     )
 

@@ -31,6 +31,8 @@ def publish(trainer: Trainer, curve: Curve, gate: VisibilityGate | None, output:
         output: the folder.
     """
     avatar, clip = trainer.avatar, trainer.data.clip
+    ever_visible = trainer.objective.visibility_cache.ever_visible(len(avatar.base_color))
+    avatar.representation.forget_unseen(ever_visible)
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
         color_unseen(avatar)

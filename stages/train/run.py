@@ -24,7 +24,7 @@ from stages.train.objective import describe_objective
 from stages.train.poses import PoseRefinement
 from stages.train.publish import publish
 from stages.train.schedule import step_costs
-from stages.train.settings import TrainSettings, apply_plan
+from stages.train.settings import TrainSettings, apply_plan, apply_representation
 from stages.train.timer import TrainingTimer
 from stages.train.visibility_gate import VisibilityGate
 
@@ -52,7 +52,8 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     inputs, log = context.inputs, context.log
     auxiliary, margin = inputs.get("auxiliary"), context.settings.crop_margin
     data = read_training_data(inputs["ingest"], inputs["fit"], auxiliary, context.body_file, margin)
-    settings = apply_plan(context.settings, read_plan(inputs["plan"] / "plan.json"))
+    plan = read_plan(inputs["plan"] / "plan.json")
+    settings = apply_representation(apply_plan(context.settings, plan))
     device = resolve(settings.device)
     kind = str(product_dtype(device, settings.half_precision)).removeprefix("torch.")
     log(f"computes on {device}, heads in {kind}")
@@ -86,7 +87,7 @@ def build_trainer(
 
     Args:
         data: to learn from.
-        settings: with the plan applied.
+        settings: with plan and representation applied.
         device: where it computes.
         network: LPIPS, if it has a weight.
         log: for a line on the avatar.

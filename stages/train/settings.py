@@ -36,6 +36,7 @@ Deviation = Annotated[float, Field(ge=0, le=10)]
 Frequencies = Annotated[int, Field(ge=0, le=32)]
 Threshold = Annotated[float, Field(gt=0, le=1)]
 Rings = Annotated[int, Field(ge=0, le=1000)]
+BasesCount = Annotated[int, Field(ge=0, le=256)]
 Pixels = Annotated[int, Field(ge=0, le=8192)]
 
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
@@ -64,7 +65,14 @@ class TrainSettings:
     # to mean (pipeline/device.py); run.json does.
     device: Device = setting("auto", "where it computes; auto: cuda where there is a GPU and gsplat")
 
-    # Representation
+    # Representation; planes, heads, residual colours and noise are the triplane's (apply_representation)
+    representation: Literal["triplane", "bases"] = setting(
+        "triplane", "the paper's triplane and heads, or each Gaussian's own parameters and bases"
+    )
+    # A prototype on smile: 35.8, 36.5 and 35.9 dB with 0, 8 and 16; more learn the clip by heart.
+    bases: BasesCount = setting(
+        8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
+    )
     subdivisions: Levels = setting(1, "levels of midpoint subdivision")
     subdivide_from: Fraction = setting(0.5, "fraction of the run before which the mesh stays unsubdivided")
     plane_resolution: Texels = setting(128, "texels along a side of each plane")
@@ -130,6 +138,10 @@ class TrainSettings:
     # Optimiser
     learning_rate: LearningRate = setting(1e-3, "of the heads")
     plane_learning_rate: LearningRate = setting(5e-3, "of the triplane")
+    color_learning_rate: LearningRate = setting(0.02, "of the bases' representation: static colours, logits")
+    scale_learning_rate: LearningRate = setting(0.01, "likewise: log scales")
+    offset_learning_rate: LearningRate = setting(0.01, "likewise: static offsets, in offset_unit")
+    bases_learning_rate: LearningRate = setting(0.002, "likewise: the linear bases")
     final_rate: Fraction = setting(0.05, "the cosine schedule's last factor")
     warm_up: CountOrNone = setting(20, "iterations")
     refine_poses: bool = setting(True, "optimise the training frames' poses too")
@@ -199,7 +211,36 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
         refine_poses=settings.refine_poses and plan.on("pose_refinement"),
         face=settings.face if plan.on("face_loss") else 0.0,
         gate=settings.gate and plan.on("visibility_gate"),
+        bases=settings.bases if plan.on("pose_heads") else 0,
     )
+
+
+def apply_representation(settings: TrainSettings) -> TrainSettings:
+    """The settings as the representation needs them; those of the triplane stay as they are.
+
+    Bases are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of
+    which is only won back. They follow the pose from the first step, too, without noise, and have no residual
+    colours.
+    """
+    if settings.representation == "triplane":
+        return settings
+    return dataclasses.replace(
+        settings,
+        subdivide_from=0.0,
+        pose_heads_from=0.0 if settings.bases else 1.0,
+        pose_seen_only=False,
+        pose_noise=0.0,
+        residual_parts=(),
+        residual_from=1.0,
+    )
+
+
+def learning_rates(settings: TrainSettings) -> tuple[str, ...]:
+    """The names of the learning rates that are in use, the pictures' first."""
+    if settings.representation == "triplane":
+        return ("learning_rate", "plane_learning_rate", "pose_learning_rate")
+    own = ("color_learning_rate", "scale_learning_rate", "offset_learning_rate", "bases_learning_rate")
+    return (*own, "pose_learning_rate")
 
 
 def subdivision_levels(plan: Plan) -> int:

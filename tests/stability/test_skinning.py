@@ -213,8 +213,8 @@ def test_group_norm_of_equal_channels_is_finite(body, dtype):
 def test_scales_and_colours_of_extreme_heads_stay_in_their_ranges(body, value):
     avatar = Avatar(body, mean_identity(body), torch.arange(200), SMALL, half_precision=False).train()
     with torch.no_grad():
-        avatar.geometry.last.bias[3:] = value
-        avatar.color.last.bias[:] = value
+        avatar.representation.geometry.last.bias[3:] = value
+        avatar.representation.color.last.bias[:] = value
     posed = avatar.pose(avatar.decode(0), before_the_camera(torch.zeros(55, 3)))
     gaussians = posed.gaussians
     assert gaussians.scales.isfinite().all() and 0 < gaussians.scales.min() <= gaussians.scales.max() <= 0.03

@@ -196,15 +196,15 @@ def test_published_avatar_renders_the_held_out_frame(subject, finished):
 
 def test_published_avatar_has_learnt_residuals_of_what_is_seen(finished):
     avatar = load_avatar(finished / "avatar.safetensors", load_body(BODY_FILE))
-    assert list(avatar.residuals.heads) == ["face"]  # the hands hang below the picture
+    assert list(avatar.representation.residuals.heads) == ["face"]  # the hands hang below the picture
     assert avatar.residuals_active and avatar.pose_heads_active
-    torch.testing.assert_close(avatar.residuals.time_range, torch.tensor([0.5, 0.9]))
-    assert bool((avatar.residuals.heads["face"].last.weight != 0).any())
+    torch.testing.assert_close(avatar.representation.residuals.time_range, torch.tensor([0.5, 0.9]))
+    assert bool((avatar.representation.residuals.heads["face"].last.weight != 0).any())
 
 
 def test_residuals_can_be_left_out(subject, tmp_path):
     trainer = trainer_for(context_for(subject, tmp_path / "never", residual_from=1.0))
-    assert not trainer.avatar.residuals.heads
+    assert not trainer.avatar.representation.residuals.heads
     assert "residual_size" not in trainer.step()
 
 
@@ -234,11 +234,11 @@ def test_weight_that_is_not_finite_is_never_published(subject, tmp_path, monkeyp
     def step(self):
         values = original(self)
         if self.iteration == 3:
-            self.avatar.color.last.bias.data[0] = float("inf")
+            self.avatar.representation.color.last.bias.data[0] = float("inf")
         return values
 
     monkeypatch.setattr(Trainer, "step", step)
-    with pytest.raises(UserError, match="avatar.color.last.bias is not finite after iteration 3"):
+    with pytest.raises(UserError, match="color.last.bias is not finite after iteration 3"):
         stage.run(context)
     assert not list(context.output.iterdir())
 

@@ -22,7 +22,7 @@ from stages.train import objective
 from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
 from stages.train.run import build_trainer
-from stages.train.settings import TrainSettings, apply_plan
+from stages.train.settings import TrainSettings, apply_plan, apply_representation
 from tests.plans import plan_of
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
@@ -124,7 +124,8 @@ def data_for(context) -> TrainingData:
 
 def trainer_for(context) -> Trainer:
     """A trainer as the stage builds it under a context; hooks that write files are not among its hooks."""
-    settings = apply_plan(context.settings, read_plan(context.inputs["plan"] / "plan.json"))
+    plan = read_plan(context.inputs["plan"] / "plan.json")
+    settings = apply_representation(apply_plan(context.settings, plan))
     return build_trainer(data_for(context), settings)
 
 

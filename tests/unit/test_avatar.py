@@ -152,7 +152,7 @@ def test_gradients_reach_static_heads_always_and_pose_heads_when_active(avatar):
     awakened(avatar)
     without, active = gradients(avatar, False), gradients(avatar, True)
     for name in without:
-        if name.startswith("pose_"):
+        if name.startswith("representation.pose_"):
             assert without[name] == 0, name
         else:
             assert without[name] > 0, name
@@ -162,7 +162,7 @@ def test_gradients_reach_static_heads_always_and_pose_heads_when_active(avatar):
 def test_texels_that_only_gated_vertices_would_read_get_no_gradient(body, identity, avatar):
     awakened(avatar)
     gradients(avatar, True)
-    touched = avatar.triplane.planes.grad.abs().sum(-1).flatten() > 0
+    touched = avatar.representation.triplane.planes.grad.abs().sum(-1).flatten() > 0
     read = torch.zeros(len(touched), dtype=torch.bool)
     read[avatar.surfaces[-1].samples.matrix.col_indices()] = True
     assert touched.any() and not (touched & ~read).any()
@@ -227,7 +227,7 @@ def test_avatar_in_training_forgets_what_it_decoded(avatar):
 
 
 def test_avatar_is_not_saved_with_a_number_that_is_not_finite(tmp_path, avatar):
-    avatar.color.last.bias.data[1] = float("nan")
+    avatar.representation.color.last.bias.data[1] = float("nan")
     with pytest.raises(ValueError, match="color.last.bias"):
         save_avatar(tmp_path / "avatar.safetensors", avatar)
     assert not list(tmp_path.iterdir())

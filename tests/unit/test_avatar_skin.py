@@ -23,7 +23,7 @@ def an_avatar(body) -> Avatar:
     sizes = Architecture(plane_resolution=16, plane_channels=4, width=16, subdivisions=1, offset_unit=0.2)
     avatar = Avatar(body, mean_identity(body), kept, sizes, half_precision=False)
     generator = torch.Generator().manual_seed(3)
-    avatar.geometry.last.weight.data = 0.1 * torch.randn(6, 16, generator=generator)
+    avatar.representation.geometry.last.weight.data = 0.1 * torch.randn(6, 16, generator=generator)
     return avatar.eval()
 
 

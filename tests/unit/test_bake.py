@@ -46,7 +46,7 @@ def an_avatar(body, architecture=SMALL, half_precision=False, directions=None) -
     for parameter in avatar.parameters():
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=generator)
     avatar.base_color.normal_(generator=generator)
-    avatar.residuals.time_range.copy_(torch.tensor([0.0, 4.0]))
+    avatar.representation.residuals.time_range.copy_(torch.tensor([0.0, 4.0]))
     return avatar.eval()
 
 
@@ -75,7 +75,7 @@ def test_baked_gaussians_are_the_avatars(body, heads):
 def test_baked_residual_colours_follow_the_time(body, place):
     avatar = an_avatar(body, dataclasses.replace(WITH_RESIDUALS, residual_place=place, place_frequencies=2))
     baked = bake(avatar)
-    assert set(baked.residuals) >= {"face", "rest"}
+    assert set(baked.representation.parts) >= {"face", "rest"}
     for time in (None, 1.3, 9.0):
         assert_same(avatar, baked, 1e-4, time=time)
     colors = [baked.gaussians(a_pose(), time=time).colors for time in (None, 1.3)]

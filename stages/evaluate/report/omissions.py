@@ -39,11 +39,12 @@ def omissions(
     gate: GateRecord,
     plan: Plan,
     refined: RefinedTestPoses,
+    representation: str | None,
 ) -> list[Omission]:
     """The parts that ingest, train and evaluate left out of this avatar and of its numbers."""
     return [
         *_of_the_clip(footage),
-        *_of_the_avatar(gate),
+        *_of_the_avatar(gate, representation),
         *_of_the_numbers(split, settings, table),
         *_of_the_poses(split, settings, plan, refined),
     ]
@@ -61,15 +62,19 @@ def _of_the_clip(footage: Footage) -> list[Omission]:
     return found
 
 
-def _of_the_avatar(gate: GateRecord) -> list[Omission]:
+def _of_the_avatar(gate: GateRecord, representation: str | None) -> list[Omission]:
+    found = []
+    if representation == "bases":
+        why = "linear bases follow pose and face in place of heads (train.representation=bases)"
+        found.append(Omission("Triplane, pose heads and residual colours", why))
     if gate.kept >= gate.vertices:
-        return []
+        return found
     share = 100 * (1 - gate.kept / gate.vertices)
     why = (
         f"{gate.vertices - gate.kept} of {gate.vertices} body vertices ({share:.0f}%) were in too few "
         "training frames, so no Gaussians stand there; in the turn one looks through those places"
     )
-    return [Omission("What the clip never showed", why)]
+    return [*found, Omission("What the clip never showed", why)]
 
 
 def _of_the_numbers(split: Split, settings: EvaluateSettings, table: pd.DataFrame) -> list[Omission]:

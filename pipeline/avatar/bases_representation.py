@@ -1,0 +1,172 @@
+"""Parameters of each Gaussian's own, and linear bases that add to them what follows pose and face.
+
+Offset, log scale and colour are plain parameters. Of offset and colour there are K bases more; a frame adds
+their sum, each times one number of the driving signal (``driving_signal.py``). No network takes part:
+decoding is reading, and posing is one product of [6 N, K] with [K].
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.avatar.driving_signal import DrivingSignal, fit_driving_signal, signal_features
+from pipeline.avatar.representation import (
+    BakedRepresentation,
+    Change,
+    ClipConditions,
+    Condition,
+    Decoded,
+    Normals,
+    Representation,
+)
+from pipeline.avatar.sparse import gather_rows, scatter_rows
+from pipeline.avatar.surface import Surface
+from pipeline.finite import require_finite
+
+
+class BasesRepresentation(Representation):
+    """Plain parameters and K linear bases for N Gaussians.
+
+    Attributes:
+        offset: [N, 3], in ``offset_unit``.
+        log_scale: [N, 3].
+        color: [N, 3] logits, added to the base colour.
+        bases: [N, 6 K], K values each of red, green, blue (logits), x, y and z (``pose_offset_unit``).
+        signal_mean, signal_components, signal_limits: of the driving signal; zero before ``set_clip``.
+    """
+
+    half_stored = frozenset({"offset", "log_scale", "color", "bases"})
+    signal_mean: Tensor
+    signal_components: Tensor
+    signal_limits: Tensor
+
+    def __init__(self, count: int, bases: int, pose: int, expressions: int, offset_unit: float):
+        """Zeros: the fitted body in its base colours.
+
+        Args:
+            count: Gaussians of the finest level, N.
+            bases: K.
+            pose: length of theta.
+            expressions: of the body.
+            offset_unit: metres that an offset of 1 stands for.
+        """
+        super().__init__()
+        self._expressions, self._offset_unit = expressions, offset_unit
+        for name in ("offset", "log_scale", "color"):
+            self.register_parameter(name, nn.Parameter(torch.zeros(count, 3)))
+        self.bases = nn.Parameter(torch.zeros(count, 6 * bases))
+        self.register_buffer("signal_mean", torch.zeros(pose + expressions))
+        self.register_buffer("signal_components", torch.zeros(bases, pose + expressions))
+        self.register_buffer("signal_limits", torch.zeros(2, bases))
+
+    def __len__(self) -> int:
+        """K."""
+        return len(self.signal_components)
+
+    @property
+    def signal(self) -> DrivingSignal:
+        """The driving signal."""
+        return DrivingSignal(self.signal_mean, self.signal_components, self.signal_limits)
+
+    def decode(self, surface: Surface, base_color: Tensor) -> Decoded:
+        """The parameters of the surface's Gaussians."""
+        return Decoded(
+            surface=surface,
+            features=_picked(self.bases, surface),
+            offset=_picked(self.offset, surface) * self._offset_unit,
+            log_scale=_picked(self.log_scale, surface),
+            color_logit=base_color + _picked(self.color, surface),
+        )
+
+    def change(
+        self, decoded: Decoded, condition: Condition, normals: Normals, rows: Tensor | None = None
+    ) -> Change | None:
+        """The bases' sum, weighted by the driving signal; no gradient reaches the pose.
+
+        Raises:
+            NotFiniteError: pose or expression is not finite.
+        """
+        if not len(self):
+            return None
+        return _change(self.signal, self._expressions, decoded.features, condition, rows)
+
+    def set_clip(self, clip: ClipConditions) -> None:
+        """Finds the driving signal.
+
+        Raises:
+            ValueError: the clip has fewer directions than there are bases.
+        """
+        found = fit_driving_signal(signal_features(clip.theta, clip.expression, self._expressions), len(self))
+        if len(found) < len(self):
+            raise ValueError(f"the clip drives {len(found)} bases, not {len(self)}")
+        self.signal_mean.copy_(found.mean)
+        self.signal_components.copy_(found.components)
+        self.signal_limits.copy_(found.limits)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """A group for each kind of parameter."""
+        groups = {
+            "color_learning_rate": [self.color],
+            "scale_learning_rate": [self.log_scale],
+            "offset_learning_rate": [self.offset],
+        }
+        return groups | ({"bases_learning_rate": [self.bases]} if len(self) else {})
+
+    def bake(self, decoded: Decoded, pose_dependent: bool, residuals: bool) -> BakedRepresentation:
+        """The bases as they are: there is nothing that could be computed beforehand."""
+        bases = decoded.features if pose_dependent else decoded.features[:, :0]
+        return BakedBases(self.signal, self._expressions, bases)
+
+    @torch.no_grad()
+    def forget_unseen(self, seen: Tensor) -> None:
+        """Sets the bases of Gaussians that no frame showed to zero: smoothness alone has moved them."""
+        self.bases[~seen] = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class BakedBases(BakedRepresentation):
+    """The bases of a finished avatar.
+
+    Attributes:
+        signal: that drives them.
+        expressions: of the body.
+        bases: [N, 6 K].
+    """
+
+    signal: DrivingSignal
+    expressions: int
+    bases: Tensor  # [N, 6 K]
+
+    def change(self, condition: Condition, normals: Normals) -> Change | None:
+        """The bases' sum, weighted by the driving signal."""
+        if not self.bases.shape[1]:
+            return None
+        return _change(self.signal, self.expressions, self.bases, condition)
+
+
+def _change(
+    signal: DrivingSignal,
+    expressions: int,
+    bases: Tensor,  # [N, 6 K]
+    condition: Condition,
+    rows: Tensor | None = None,
+) -> Change:
+    told = {"theta": condition.theta.detach(), "the expression": condition.expression.detach()}
+    require_finite(told, "posing", "in the driving signal", "mend the motion or the pose")
+    weights = signal(signal_features(*told.values(), expressions))
+    asked = bases if rows is None else gather_rows(bases, rows)
+    answer = (asked.reshape(-1, len(weights)) @ weights).view(-1, 6)
+    if rows is not None:
+        answer = scatter_rows(answer, rows, len(bases))
+    return Change(offset=answer[:, 3:], color_logit=answer[:, :3])
+
+
+def _picked(values: Tensor, surface: Surface) -> Tensor:
+    """The surface's rows of what is known of every Gaussian of the finest level, differentiably."""
+    if surface.rows is not None:
+        return gather_rows(values, surface.rows)
+    count = len(surface.canonical)
+    return values if count == len(values) else values[:count]
