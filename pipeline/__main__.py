@@ -7,6 +7,7 @@ same line works under any scheduler. ``python -m pipeline settings train`` lists
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -45,8 +46,12 @@ def print_settings(names: list[str]) -> int:
     if unknown:
         print(f"there is no stage '{unknown[0]}'{near(unknown[0], stages)}", file=sys.stderr)
         return 1
-    for name in names or stages:
-        print("\n".join(help_lines(stages[name].settings, name)))
+    try:
+        for name in names or stages:
+            print("\n".join(help_lines(stages[name].settings, name)))
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
