@@ -31,6 +31,7 @@ def columns(points):
     return pd.Series([c for c, _ in points], dtype=float), pd.Series([q for _, q in points], dtype=float)
 
 
+@settings(deadline=None)
 @given(POINTS)
 def test_a_frontier_is_what_nothing_dominates(points):
     known = [point for point in points if not any(map(math.isnan, point))]
@@ -40,6 +41,7 @@ def test_a_frontier_is_what_nothing_dominates(points):
     assert all(a[0] < b[0] and a[1] < b[1] for a, b in zip(chosen, chosen[1:], strict=False))
 
 
+@settings(deadline=None)
 @given(POINTS, st.randoms())
 def test_a_frontier_does_not_hang_on_the_order_and_is_its_own(points, random):
     def of(some):
@@ -50,6 +52,7 @@ def test_a_frontier_does_not_hang_on_the_order_and_is_its_own(points, random):
     assert of(points) == of(shuffled) == of(of(points))
 
 
+@settings(deadline=None)
 @given(POINTS)
 def test_what_lies_on_the_frontier_lacks_nothing_and_all_else_something(points):
     kept, lacks = frontier(*columns(points)), shortfalls(*columns(points))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.clip.curves import SCHEMA
@@ -69,6 +69,7 @@ def test_a_lone_number_is_not_the_best():
     assert not alone.best.any(axis=None) and "**30.00**" not in markdown(alone)
 
 
+@settings(deadline=None)
 @given(st.text(alphabet=st.sampled_from([*map(chr, LATEX), "a", "B", " ", "7"])))
 def test_nothing_is_left_that_latex_takes_for_something_else(text):
     shown = text.translate(LATEX)
@@ -306,6 +307,7 @@ def test_plots_of_next_to_nothing(tmp_path):
     assert all(cv2.imread(str(tmp_path / f"{name}.png")) is not None for name in "abcde")
 
 
+@settings(deadline=None)
 @given(st.floats(1e-3, 1e5), st.floats(1.3, 1e5))
 def test_a_logarithmic_axis_has_ticks_enough_to_read_it(low, ratio):
     ticks = round_ticks(low, low * ratio)
