@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 QUIET_SECONDS = 10.0  # between two lines where there is no terminal
@@ -17,45 +18,46 @@ class TimeLeft:
     """
 
     def __init__(self, costs: Sequence[float]):
-        """Starts with nothing measured.
+        """Starts with nothing done.
 
         Args:
             costs: relative cost of each step, positive; only their ratios count.
         """
         self._costs = tuple(costs)
+        self._done = 0
+        self._ahead = Counter(self._costs)
         self._seconds: dict[float, float] = {}
         self._steps: dict[float, int] = {}
-        self._begun: set[float] = set()
 
-    def measured(self, step: int, count: int, seconds: float) -> None:
-        """Counts what ``count`` steps from ``step`` on took.
+    def skip(self, count: int) -> None:
+        """Counts steps as done without a word of their time."""
+        self._ahead.subtract(self._costs[self._done : self._done + count])
+        self._done += count
+
+    def measured(self, count: int, seconds: float) -> None:
+        """Counts the time of the next ``count`` steps.
 
         The first of a phase only opens it: kernels are compiled then, which happens once.
         """
-        if step >= len(self._costs):
-            return
-        cost = self._costs[step]
-        if cost not in self._begun:
-            self._begun.add(cost)
-            return
-        self._seconds[cost] = self._seconds.get(cost, 0.0) + seconds
-        self._steps[cost] = self._steps.get(cost, 0) + count
+        if self._done < len(self._costs):
+            cost = self._costs[self._done]
+            opened = cost in self._steps
+            self._steps[cost] = self._steps[cost] + count if opened else 0
+            self._seconds[cost] = self._seconds[cost] + seconds if opened else 0.0
+        self.skip(count)
 
-    def seconds(self, done: int) -> float | None:
-        """Seconds that the steps after ``done`` will take; None while nothing was measured."""
+    def seconds(self) -> float | None:
+        """Seconds that the steps ahead will take; None while nothing was measured."""
         spent = sum(self._seconds.values())
         work = sum(cost * count for cost, count in self._steps.items())
         if not work:
             return None
-        ahead: dict[float, int] = {}
-        for cost in self._costs[done:]:
-            ahead[cost] = ahead.get(cost, 0) + 1
 
         def of_a_step(cost: float) -> float:
             count = self._steps.get(cost, 0)
             return self._seconds[cost] / count if count else cost * spent / work
 
-        return sum(count * of_a_step(cost) for cost, count in ahead.items())
+        return sum(count * of_a_step(cost) for cost, count in self._ahead.items())
 
 
 class Progress:
@@ -90,6 +92,7 @@ class Progress:
     def skip(self, steps: int) -> None:
         """Counts steps as done that an earlier process did; they say nothing of this one's speed."""
         self.done += steps
+        self._left.skip(steps)
         self._last = self._clock()
         if self.bar is not None:
             self.bar.update(steps)
@@ -97,7 +100,7 @@ class Progress:
     def advance(self, steps: int = 1, note: str = "") -> None:
         """Counts ``steps`` more as done; ``note`` is shown beside the time left."""
         now = self._clock()
-        self._left.measured(self.done, steps, now - self._last)
+        self._left.measured(steps, now - self._last)
         self.done, self._last = self.done + steps, now
         words = ", ".join(word for word in (self._time_left(), note) if word)
         if self.bar is not None:
@@ -108,7 +111,7 @@ class Progress:
             print(f"{self.label}: {self.done}/{self.total}, {words}".rstrip(", "), flush=True)
 
     def _time_left(self) -> str:
-        seconds = self._left.seconds(self.done)
+        seconds = self._left.seconds()
         return "" if seconds is None else f"{seconds:.0f} s left"
 
     def close(self) -> None:
