@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
-from pipeline.avatar.density import choose_splits, project_surface
+from pipeline.avatar.density import DENSITY_FRAMES, choose_splits, project_surface
 from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
 from pipeline.device import moved
@@ -21,8 +21,6 @@ from stages.train.initial_colors import initial_color_logits
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import ever_in_frame
-
-DENSITY_FRAMES = 12  # training frames, evenly spread, in which edges are measured
 
 
 def initial_avatar(

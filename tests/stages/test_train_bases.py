@@ -136,7 +136,7 @@ def test_plan_without_change_of_pose_gives_no_bases():
 
 
 def test_triplane_is_left_as_it_was(subject):
-    settings = apply_plan(TrainSettings(), read_plan(subject / "plan" / "plan.json"))
+    settings = apply_plan(TrainSettings(representation="triplane"), read_plan(subject / "plan" / "plan.json"))
     assert apply_representation(settings) is settings
 
 

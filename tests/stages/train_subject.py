@@ -28,6 +28,7 @@ from tests.plans import plan_of
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
 FRAMES, WIDTH, HEIGHT = 6, 48, 64
 TINY = TrainSettings(
+    representation="triplane",
     iterations=12,
     held_out_every=6,
     held_out_frames=1,
