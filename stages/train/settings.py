@@ -41,6 +41,20 @@ EdgePixels = Annotated[float, Field(ge=0, le=1000)]
 Effort = Annotated[float, Field(gt=0, le=1000)]
 
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
+IGNORED = {
+    "triplane": (
+        "edge_pixels", "bases", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
+        "bases_learning_rate",
+    ),
+    "bases": (
+        "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
+        "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
+        "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
+        "time_frequencies", "time_dropout", "learning_rate", "plane_learning_rate",
+    ),
+}  # fmt: skip
+"""The settings that a representation does not read."""
+
 TRIPLANE_STEPS = 2.0  # times as many as the bases take
 MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 
@@ -252,6 +266,13 @@ def apply_representation(settings: TrainSettings) -> TrainSettings:
         residual_parts=(),
         residual_from=1.0,
     )
+
+
+def settings_without_effect(settings: TrainSettings) -> tuple[str, ...]:
+    """The names of settings that differ from their defaults and that the representation does not read."""
+    usual = TrainSettings()
+    ignored = IGNORED[settings.representation]
+    return tuple(name for name in ignored if getattr(settings, name) != getattr(usual, name))
 
 
 def learning_rates(settings: TrainSettings) -> tuple[str, ...]:

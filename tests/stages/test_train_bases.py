@@ -13,7 +13,12 @@ from pipeline.errors import UserError
 from pipeline.finite import NotFiniteError
 from stages.train import run as stage
 from stages.train.loop import Trainer
-from stages.train.settings import TrainSettings, apply_plan, apply_representation
+from stages.train.settings import (
+    TrainSettings,
+    apply_plan,
+    apply_representation,
+    settings_without_effect,
+)
 from tests.plans import plan_of
 from tests.stages.train_subject import BODY_FILE, context_for, moving_poses, trainer_for, write_subject
 
@@ -133,6 +138,16 @@ def test_plan_without_change_of_pose_gives_no_bases():
     assert (asked.bases, asked.pose_heads_from) == (0, 1.0)
     asked = apply_representation(apply_plan(settings, plan_of()))
     assert (asked.bases, asked.pose_heads_from, asked.subdivide_from) == (settings.bases, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("representation", "name", "value"),
+    [("bases", "pose_noise", 0.1), ("bases", "plane_resolution", 64), ("triplane", "bases", 3)],
+)
+def test_settings_that_the_representation_does_not_read_are_named(representation, name, value):
+    settings = TrainSettings(representation=representation, **{name: value}, l1=0.7)
+    assert settings_without_effect(settings) == (name,)
+    assert settings_without_effect(TrainSettings(representation=representation)) == ()
 
 
 def test_triplane_is_left_as_it_was(subject):
