@@ -34,7 +34,7 @@ def initial_avatar(
     Args:
         data: what it will be learnt from.
         refinement: the fitted poses.
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         log: for a line with the numbers of vertices and Gaussians.
 
     Returns:
@@ -124,7 +124,7 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
     """The part of the settings that an avatar's file has to remember; no more bases than the clip drives.
 
     Args:
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         conditions: of the training frames.
         expressions: of the body.
     """

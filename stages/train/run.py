@@ -27,7 +27,6 @@ from stages.train.schedule import step_costs
 from stages.train.settings import (
     TrainSettings,
     apply_plan,
-    apply_representation,
     settings_without_effect,
 )
 from stages.train.timer import TrainingTimer
@@ -58,7 +57,7 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     auxiliary, margin = inputs.get("auxiliary"), context.settings.crop_margin
     data = read_training_data(inputs["ingest"], inputs["fit"], auxiliary, context.body_file, margin)
     plan = read_plan(inputs["plan"] / "plan.json")
-    settings = apply_representation(apply_plan(context.settings, plan))
+    settings = apply_plan(context.settings, plan)
     device = resolve(settings.device)
     log_computing(context, device)
     started = time.monotonic()
@@ -105,7 +104,7 @@ def build_trainer(
 
     Args:
         data: to learn from.
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         device: where it computes.
         network: LPIPS, if it has a weight.
         log: for a line on the avatar.

@@ -82,7 +82,7 @@ class TrainSettings:
     # to mean (pipeline/device.py); run.json does.
     device: Device = setting("auto", "where it computes; auto: cuda where there is a GPU and gsplat")
 
-    # Representation; planes, heads, residual colours and noise are the triplane's (apply_representation)
+    # Representation; planes, heads, residual colours and noise are the triplane's
     representation: Literal["bases", "triplane"] = setting(
         "bases", "each Gaussian's own parameters and bases, or the paper's triplane and heads"
     )
@@ -221,12 +221,16 @@ class TrainSettings:
 
 
 def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
-    """The settings with what the plan calls needless switched off; the plan switches nothing on."""
+    """The settings that training really runs with.
+
+    What the plan calls needless is switched off; it switches nothing on. Numbers that are left to it are its.
+    Then come the representation's own (``_for_bases``).
+    """
     needless = {part for part in PLANNED_RESIDUALS if not plan.on(f"{part}_residual")}
     parts = tuple(part for part in settings.residual_parts if part not in needless)
     density = plan["gaussians"]
     edge_pixels = density.threshold if density.on else 0.0
-    return dataclasses.replace(
+    applied = dataclasses.replace(
         settings,
         iterations=settings.iterations or planned_steps(settings, plan),
         edge_pixels=edge_pixels if settings.edge_pixels is None else settings.edge_pixels,
@@ -239,6 +243,7 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
         gate=settings.gate and plan.on("visibility_gate"),
         bases=settings.bases if plan.on("pose_heads") else 0,
     )
+    return _for_bases(applied) if settings.representation == "bases" else applied
 
 
 def planned_steps(settings: TrainSettings, plan: Plan) -> int:
@@ -247,15 +252,13 @@ def planned_steps(settings: TrainSettings, plan: Plan) -> int:
     return max(1, round(settings.effort * more * plan["steps"].values[0]))
 
 
-def apply_representation(settings: TrainSettings) -> TrainSettings:
-    """The settings as the representation needs them; those of the triplane stay as they are.
+def _for_bases(settings: TrainSettings) -> TrainSettings:
+    """The settings as linear bases need them.
 
-    Bases are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of
+    They are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of
     which is only won back. They follow the pose from the first step, too, without noise, and have no residual
     colours.
     """
-    if settings.representation == "triplane":
-        return settings
     return dataclasses.replace(
         settings,
         subdivisions=0 if settings.edge_pixels else settings.subdivisions,

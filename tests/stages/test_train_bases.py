@@ -7,7 +7,6 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body, read_poses, write_poses
-from pipeline.clip.plan import read_plan
 from pipeline.clip.records import Split, write_split
 from pipeline.errors import UserError
 from pipeline.finite import NotFiniteError
@@ -16,7 +15,6 @@ from stages.train.loop import Trainer
 from stages.train.settings import (
     TrainSettings,
     apply_plan,
-    apply_representation,
     settings_without_effect,
 )
 from tests.plans import plan_of
@@ -134,9 +132,9 @@ def test_fitted_expression_that_is_not_finite_is_refused_with_its_frame(subject,
 
 def test_plan_without_change_of_pose_gives_no_bases():
     settings = TrainSettings(representation="bases")
-    asked = apply_representation(apply_plan(settings, plan_of(pose_heads=False)))
+    asked = apply_plan(settings, plan_of(pose_heads=False))
     assert (asked.bases, asked.pose_heads_from) == (0, 1.0)
-    asked = apply_representation(apply_plan(settings, plan_of()))
+    asked = apply_plan(settings, plan_of())
     assert (asked.bases, asked.pose_heads_from, asked.subdivide_from) == (settings.bases, 0.0, 0.0)
 
 
@@ -148,11 +146,6 @@ def test_settings_that_the_representation_does_not_read_are_named(representation
     settings = TrainSettings(representation=representation, **{name: value}, l1=0.7)
     assert settings_without_effect(settings) == (name,)
     assert settings_without_effect(TrainSettings(representation=representation)) == ()
-
-
-def test_triplane_is_left_as_it_was(subject):
-    settings = apply_plan(TrainSettings(representation="triplane"), read_plan(subject / "plan" / "plan.json"))
-    assert apply_representation(settings) is settings
 
 
 def test_rates_far_too_high_are_refused_by_the_rates_that_bases_have(subject, tmp_path):
