@@ -6,10 +6,12 @@ generated views too, which the quick preset leaves out. What two variants share 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
 from pipeline.run.progress import Progress
 from pipeline.store.artifact import read_manifest
-from pipeline.studies.measure import AvatarMeter, score_table
+from pipeline.studies.measure import AvatarMeter, Numbers, score_table
 from pipeline.studies.plots import bars
 from pipeline.studies.report import Page, Section, closing_sections, publish, sizes_of, study_folder
 from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, REGIONS, RUNTIME, Table
@@ -65,15 +67,22 @@ class Ablation:
 
     Attributes:
         results: (subject, key of the variant) -> result.
-        scores: a row a result, indexed likewise; columns as in ``score_table``.
+        speeds: as ``AvatarMeter.speeds`` gives them.
         dataset: the one that all subjects belong to; empty if none.
         refined: whether the scores are those with held-out poses refined, as on NeuMan.
     """
 
     results: Mapping[tuple[str, str], Result]
-    scores: pd.DataFrame
+    speeds: Mapping[Path, Numbers]
     dataset: str = ""
     refined: bool = False
+
+    @functools.cached_property
+    def scores(self) -> pd.DataFrame:
+        """A row a result, indexed like the results; columns as in ``score_table``."""
+        method = "avatar_refined" if self.refined else "avatar"
+        index = pd.MultiIndex.from_tuples(list(self.results), names=["subject", "variant"])
+        return score_table(list(self.results.values()), self.speeds, method).set_axis(index)
 
     @property
     def subjects(self) -> list[str]:
@@ -107,39 +116,45 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     """
     scale_overrides(request)  # refused before anything is made
     start, folder = time.monotonic(), study_folder(request.workspace.data, "ablate", name)
-    bases: dict[str, Base] = {}
-    results: dict[tuple[str, str], Result] = {}
-    speeds: dict[Path, Mapping[str, float]] = {}
-    progress = Progress(len(subjects) * len(LABELS), "ablate")
-    for subject in subjects:
-        try:
-            base = base_of(subject, request, folder / "log.txt", {"auxiliary.generator": "auto"})
-        except UserError as error:
-            results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
-            progress.advance(len(LABELS), subject)
-            continue
-        bases[subject] = base
-        own = dict(run_variants(base, progress))
-        results |= {(subject, key): result for key, result in own.items()}
-        done = [result for result in own.values() if not result.failure]
-        if done:
-            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
-    progress.close()
+    bases, results = run_all(subjects, request, folder / "log.txt")
     if all(result.failure for result in results.values()):
         raise UserError(next(iter(results.values())).failure)
     refined = all(counts_refined(base) for base in bases.values())
-    ablation = ablation_of(results, speeds, dataset_of(subjects, request), refined)
+    speeds = speeds_of(bases, results)
+    ablation = Ablation(results, speeds, dataset_of(subjects, request), refined)
     write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
     return folder
 
 
-def run_variants(base: Base, progress: Progress) -> Iterator[tuple[str, Result]]:
-    """Every variant's key and result, one made after the other."""
-    for key, variant in variants_of(base).items():
-        result = base.run(variant)
-        print(result.line, flush=True)
-        progress.advance(1, variant.name)
-        yield key, result
+def run_all(
+    subjects: Sequence[str], request: Request, log: Path
+) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
+    """Every variant of every subject, a subject after the other; and the bases that could be read."""
+    bases: dict[str, Base] = {}
+    results: dict[tuple[str, str], Result] = {}
+    with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
+        for subject in subjects:
+            try:
+                bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
+            except UserError as error:
+                results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
+                progress.advance(len(LABELS), subject)
+                continue
+            for key, variant in variants_of(bases[subject]).items():
+                results[subject, key] = bases[subject].run(variant)
+                print(results[subject, key].line, flush=True)
+                progress.advance(1, variant.name)
+    return bases, results
+
+
+def speeds_of(bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result]) -> dict[Path, Numbers]:
+    """The numbers of ``AvatarMeter.speeds`` of all results; each subject's avatars are timed together."""
+    speeds: dict[Path, Numbers] = {}
+    for subject, base in bases.items():
+        done = [one for one in results.values() if one.subject == subject and not one.failure]
+        if done:
+            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
+    return speeds
 
 
 def variants_of(base: Base) -> dict[str, Variant]:
@@ -160,42 +175,28 @@ def counts_refined(base: Base) -> bool:
     return evaluate.refine_test_poses == "on" or getattr(evaluate, "protocol", "") == "paper"
 
 
-def ablation_of(
-    results: Mapping[tuple[str, str], Result],
-    speeds: Mapping[Path, Mapping[str, float]],
-    dataset: str = "",
-    refined: bool = False,
-) -> Ablation:
-    """The results with their table of scores; ``speeds`` are those of ``AvatarMeter``."""
-    scores = score_table(list(results.values()), speeds, "avatar_refined" if refined else "avatar")
-    scores.index = pd.MultiIndex.from_tuples(list(results), names=["subject", "variant"])
-    return Ablation(results, scores, dataset, refined)
-
-
 def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
     """The paper's tables with what was measured here; those of which nothing was measured are left out.
 
-    Args:
-        ablation: its results.
-        sizes: a sentence on the sizes, for the captions.
+    ``sizes`` stand in the captions, see ``sizes_of``.
     """
     noise = ablation.gains("psnr")[CHANCE]
-    sizes += f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
+    chance = f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
     described = [*read_toml(Path(__file__).with_name("paper.toml"))["tables"], CHANCE_TABLE]
     return [
-        table_of(about, ablation, sizes)
+        table_of(about, ablation, f"Sizes: {sizes}.{chance}")
         for about in described
         if ablation.scores[COLUMNS.get(about.get("kind", ""), list(IMAGE))].notna().any(axis=None)
     ]
 
 
-def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
+def table_of(about: Mapping[str, Any], ablation: Ablation, remark: str) -> Table:
     """One of the paper's tables; its own figures stand beside ours where they are of the same footage.
 
     Args:
         about: the table as paper.toml describes it.
         ablation: its results.
-        sizes: a sentence for the caption.
+        remark: ends the caption.
     """
     kind, wanted = about.get("kind", ""), [row["variant"] for row in about["rows"]]
     keys = COLUMNS.get(kind, list(IMAGE))
@@ -217,7 +218,7 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
     poses = ", poses refined on them" if ablation.refined else ""
     caption = CAPTIONS.get(kind, f"Means over held-out frames{poses}.")
     table = pd.concat(rows).rename_axis(None)
-    return Table(about["name"], about["title"], f"{caption} {sizes}", table, ranked=kind != "chance")
+    return Table(about["name"], about["title"], f"{caption} {remark}", table, ranked=kind != "chance")
 
 
 def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
@@ -262,15 +263,7 @@ BARS = (
 
 
 def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seconds: float) -> None:
-    """Writes the tables, the plots and the page.
-
-    Args:
-        folder: where they go.
-        name: of the study.
-        ablation: its results.
-        base: a subject's, for the settings.
-        seconds: of this call.
-    """
+    """Writes the tables, the plots and the page, with one subject's settings and the seconds of this call."""
     pictures = []
     for metric, factor, label, file in BARS:
         gains = factor * ablation.gains(metric)

@@ -8,7 +8,6 @@ import importlib.metadata
 import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import pandas as pd
@@ -19,7 +18,7 @@ from pipeline.store.artifact import read_manifest
 from pipeline.store.digest import write_atomically
 from pipeline.studies.sweep import mesh_of, picture_setting, setting_of
 from pipeline.studies.tables import Table, latex, markdown
-from pipeline.studies.variants import Base, Overrides, Result, run_record
+from pipeline.studies.variants import Base, Overrides, Result, Settings, run_record
 
 LIBRARIES = ("torch", "numba", "numpy")
 
@@ -140,12 +139,8 @@ def versions_of(result: Result) -> list[tuple[str, str]]:
     ]
 
 
-def sizes_of(settings: Mapping[str, Any]) -> str:
-    """A sentence on how large and how long the base's run is, for captions.
-
-    Args:
-        settings: stage -> settings of the base.
-    """
+def sizes_of(settings: Settings) -> str:
+    """How large and how long the base's run is, in words."""
     iterations, side = settings["train"].iterations, setting_of(settings, picture_setting(settings["ingest"]))
     small = "; small: a part that needs a long run shows less than it is worth" if iterations < 1000 else ""
-    return f"Sizes: {iterations:,} iterations, {mesh_of(settings)}, pictures of {side} px{small}."
+    return f"{iterations:,} iterations, {mesh_of(settings)}, pictures of {side} px{small}"

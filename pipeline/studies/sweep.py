@@ -9,12 +9,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import pandas as pd
 
-from pipeline.studies.variants import another_seed
+from pipeline.studies.variants import Settings, another_seed
 
 SUBDIVISIONS = ("no subdivision", "one subdivision", "two subdivisions")
 CHANCE = "chance"  # the parameter that buys nothing: another seed
@@ -72,12 +72,8 @@ SWITCHED = (
 )
 
 
-def sweep_levels(settings: Mapping[str, Any]) -> list[Level]:
-    """Every level to try alone: each parameter's first before any parameter's second, the fastest first.
-
-    Args:
-        settings: stage -> settings of the base.
-    """
+def sweep_levels(settings: Settings) -> list[Level]:
+    """Every level to try alone: each parameter's first before any parameter's second, the fastest first."""
     half, words = settings["train"].half_precision, ("float32", "bfloat16")
     precision = (("train.half_precision", str(not half).lower()),)
     levels = [
@@ -92,7 +88,7 @@ def sweep_levels(settings: Mapping[str, Any]) -> list[Level]:
     return [level for _, level in sorted(zip(depths, levels, strict=True), key=lambda x: (x[0], x[1].factor))]
 
 
-def _scaled(settings: Mapping[str, Any]) -> Iterator[Level]:
+def _scaled(settings: Settings) -> Iterator[Level]:
     """Multiples of the base's own number."""
     for parameter, name, factors, multiple, exponent, words in SCALED:
         name = name or picture_setting(settings["ingest"])
@@ -104,7 +100,7 @@ def _scaled(settings: Mapping[str, Any]) -> Iterator[Level]:
                 yield Level(parameter, words.format(own), words.format(value), overrides, factor**exponent)
 
 
-def setting_of(settings: Mapping[str, Any], name: str) -> Any:
+def setting_of(settings: Settings, name: str) -> Any:
     """The value of a setting such as ``train.iterations``."""
     stage, _, field = name.partition(".")
     return getattr(settings[stage], field)
@@ -115,7 +111,7 @@ def picture_setting(ingest: Any) -> str:
     return "ingest.mannequin_size" if ingest.mannequin else "ingest.long_side"
 
 
-def _gaussians(settings: Mapping[str, Any]) -> Iterator[Level]:
+def _gaussians(settings: Settings) -> Iterator[Level]:
     """Levels of subdivision whatever the pixels; the base's own is what the plan leaves of it."""
     mesh = mesh_of(settings)
     own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
@@ -125,14 +121,14 @@ def _gaussians(settings: Mapping[str, Any]) -> Iterator[Level]:
             yield Level(GAUSSIANS, mesh, label, overrides, 1.8 ** (count - own))
 
 
-def mesh_of(settings: Mapping[str, Any]) -> str:
+def mesh_of(settings: Settings) -> str:
     """The fineness of a run's mesh in words."""
     plan = settings["plan"].subdivision
     own = 0 if plan == "off" else settings["train"].subdivisions
     return f"at most {SUBDIVISIONS[own]}" if own and plan == "auto" else SUBDIVISIONS[own]
 
 
-def _switched(settings: Mapping[str, Any]) -> Iterator[Level]:
+def _switched(settings: Settings) -> Iterator[Level]:
     """Each part that the base has left out, and each that it lacks and could have added."""
     train = settings["train"]
     idle = {  # parts that other settings of the base leave nothing to do
@@ -150,7 +146,7 @@ def _switched(settings: Mapping[str, Any]) -> Iterator[Level]:
             yield Level(part, without, with_it, ((setting, str(on)),), factor)
 
 
-def _chance(settings: Mapping[str, Any]) -> Level:
+def _chance(settings: Settings) -> Level:
     """Another seed."""
     overrides = tuple(another_seed(settings).overrides.items())
     return Level(CHANCE, f"seed {settings['train'].seed}", f"seed {overrides[0][1]}", overrides)

@@ -198,11 +198,11 @@ def tables_of(study: Tradeoff) -> list[Table]:
     """The points, and the registrations."""
     chance = f" Another seed differs by {study.noise:.2f} dB." if math.isfinite(study.noise) else ""
     caption = (
-        f"{sizes_of(study.base.settings)} Quality: means over held-out frames, all at the base's picture "
-        "size. Seconds are processor seconds of all threads, of the run that made the result; training "
-        "includes the views that were made for it, the whole job all up to training. Milliseconds: the baked "
-        "avatar on one thread, the least of 15 frames, drawn at 512×512. In bold letters: on the frontier of "
-        f"PSNR and training seconds.{chance}"
+        f"Sizes: {sizes_of(study.base.settings)}. Quality: means over held-out frames, all at the base's "
+        "picture size. Seconds are processor seconds of all threads, of the run that made the result; "
+        "training includes the views that were made for it, the whole job all up to training. Milliseconds: "
+        "the baked avatar on one thread, the least of 15 frames, drawn at 512×512. In bold letters: on the "
+        f"frontier of PSNR and training seconds.{chance}"
     )
     points = study.points
     failures = points["result"].map(lambda one: one.failure and f"failed: {one.failure}")

@@ -24,6 +24,9 @@ from pipeline.store.artifact import RUN
 Overrides = Mapping[str, str]
 """Setting's name -> text, as on the command line."""
 
+Settings = Mapping[str, Any]
+"""Stage -> its settings."""
+
 SCALES: Mapping[str, Overrides] = {
     "preset": {},
     "small": {"train.iterations": "200", "train.subdivisions": "0"},
@@ -51,12 +54,8 @@ class Variant:
     overrides: Overrides = dataclasses.field(default_factory=dict)
 
 
-def another_seed(settings: Mapping[str, Any]) -> Variant:
-    """The variant that shows what chance is worth: training with the next seed.
-
-    Args:
-        settings: stage -> settings of the base.
-    """
+def another_seed(settings: Settings) -> Variant:
+    """The variant that shows what chance is worth: the base, trained with the next seed."""
     return Variant("another seed", {"train.seed": str(settings["train"].seed + 1)})
 
 
@@ -125,8 +124,8 @@ class Base:
         return open_job(self.subject, self.request.override(overrides or {}))
 
     @functools.cached_property
-    def settings(self) -> Mapping[str, Any]:
-        """Stage -> settings of the base itself."""
+    def settings(self) -> Settings:
+        """The base's own."""
         return self.job().settings
 
     def missing(self, stage: str, overrides: Overrides) -> list[str]:

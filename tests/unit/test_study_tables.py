@@ -139,7 +139,7 @@ def ablation_of(folder, subjects=("smile",), dataset="samples", failing=(), refi
             if refined and not results[subject, key].failure:
                 results[subject, key].means["avatar_refined"] = refined
     speeds = {one.folders["train"]: SPEED for one in results.values() if not one.failure}
-    return ablation.ablation_of(results, speeds, dataset, bool(refined))
+    return ablation.Ablation(results, speeds, dataset, bool(refined))
 
 
 def by_name(found):
