@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline.studies.variants import Settings, another_seed
@@ -169,9 +170,8 @@ def combinations(points: pd.DataFrame) -> list[Design]:
     noise = noise_of(points)
     alone = points[~points["chance"] & points["design"].map(len).le(1)].dropna(subset=["gain", "times"])
     unbeaten = alone.index.isin(frontier(alone["times"], alone["gain"]))
-    kept = alone[
-        (alone["gain"].gt(noise if math.isfinite(noise) else 0.0) | unbeaten) & alone["design"].map(bool)
-    ]
+    gaining = alone["gain"] > (noise if math.isfinite(noise) else 0.0)
+    kept = alone[(gaining | unbeaten) & alone["design"].map(bool)]
     best = kept["design"][worth_of(kept).sort_values(kind="stable").index[::-1]][:MOST_COMBINED]
     return [
         tuple(levels)
@@ -187,11 +187,8 @@ def worth_of(points: pd.DataFrame) -> pd.Series:
     Args:
         points: ``gain``, dB over the base; ``times``, training time over the base's.
     """
-    worth = [
-        g / math.log(max(t, 1.02)) if g > 0 else g
-        for g, t in zip(points["gain"], points["times"], strict=True)
-    ]
-    return pd.Series(worth, points.index, dtype=float)
+    worth = points["gain"] / np.log(points["times"].clip(lower=1.02))
+    return worth.where(points["gain"] > 0, points["gain"])
 
 
 def frontier(costs: pd.Series, qualities: pd.Series) -> list[Any]:
