@@ -173,7 +173,7 @@ class TrainSettings:
     # Objective
     l1: Weight = setting(0.8, "lambda_L1")
     ssim: Weight = setting(0.2, "lambda_ssim")
-    # Bases: a tenth to a quarter less LPIPS for at most 0.05 dB (docs/results.md). The triplane: 0.6 dB on smile.
+    # Bases: a tenth to a quarter less LPIPS for 0.05 dB. The triplane: 0.6 dB on smile (docs/results.md).
     lpips: Weight = setting(0.05, "lambda_lpips; the paper's is 0.2")
     lpips_network: LpipsNetwork = setting("alex", "its backbone; vgg is twenty times as dear on a CPU")
     lpips_every: Count = setting(2, "drawn frames for one that LPIPS looks at, with as many times the weight")

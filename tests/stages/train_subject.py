@@ -44,6 +44,7 @@ TINY = TrainSettings(
     residual_from=0.3,
     face=0.8,
     lpips=0.0,
+    lpips_from=0.0,
 )
 
 
