@@ -1,4 +1,4 @@
-"""What the tests share: where third-party assets and the shared clips lie, if they are there."""
+"""What the tests share: the open body, a small subject, where assets and shared clips lie, if anywhere."""
 
 import os
 from pathlib import Path
@@ -28,4 +28,36 @@ def shared_folder() -> Path:
     folder = REPOSITORY.parent / "shared"
     if not folder.is_dir():
         pytest.skip("there is no ../shared here")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def body():
+    """The open body."""
+    from tests.made.body import open_body  # here, as the lines above come before torch's threads
+
+    return open_body()
+
+
+@pytest.fixture(scope="session")
+def landmarks():
+    """Where keypoints lie on the open body."""
+    from tests.made.body import open_landmarks
+
+    return open_landmarks()
+
+
+@pytest.fixture(scope="session")
+def model(body, landmarks):
+    """The open body and its landmarks, as registration takes them."""
+    return body, landmarks
+
+
+@pytest.fixture(scope="session")
+def subject(tmp_path_factory) -> Path:
+    """The painted subject in the folders of ingest, fit and plan. Read only: all tests look at this one."""
+    from tests.made.portrait import write_subject
+
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
     return folder

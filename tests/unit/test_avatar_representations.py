@@ -7,17 +7,11 @@ import torch
 from pipeline.avatar import Architecture, Avatar, ClipConditions, load_avatar, pose_features, save_avatar
 from pipeline.avatar.bake import bake
 from pipeline.avatar.representation import Condition
-from pipeline.body import Pose, load_body, mean_identity
+from pipeline.body import Pose, mean_identity
 from pipeline.finite import NotFiniteError
-from tests.conftest import REPOSITORY
 
 K, FRAMES = 3, 8
 KINDS = ("triplane", "bases")
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
 
 
 def a_pose(seed: int = 1, size: float = 0.2) -> Pose:
