@@ -31,10 +31,22 @@ def shared_folder() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session", autouse=True)
+def body_read_once():
+    """Stages that read a fitted clip get the open body that was read before: reading takes half a second."""
+    from pipeline.clip import fitted_clip  # here, as the lines above come before torch's threads
+    from tests.made.body import BODY_FILE, open_body
+
+    read = fitted_clip.load_body
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitted_clip, "load_body", lambda path: open_body() if path == BODY_FILE else read(path))
+        yield
+
+
 @pytest.fixture(scope="session")
 def body():
     """The open body."""
-    from tests.made.body import open_body  # here, as the lines above come before torch's threads
+    from tests.made.body import open_body
 
     return open_body()
 

@@ -254,5 +254,7 @@ def test_a_perfect_pose_is_left_alone(painted):
 
 def test_the_protocol_names_what_was_done():
     for name, choices in PROTOCOLS.items():
-        sentences = protocol_sentences(choices, NOT_REFINED)
+        sentences = protocol_sentences(choices, NOT_REFINED, name)
         assert "refined" not in sentences and f" {name}." in sentences
+        other = dataclasses.replace(choices, background="white" if choices.background == "black" else "black")
+        assert f" {name}." not in protocol_sentences(other, NOT_REFINED, name)
