@@ -23,7 +23,7 @@ from stages.train import objective
 from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
 from stages.train.run import build_trainer, run
-from stages.train.settings import TrainSettings, apply_plan, apply_representation
+from stages.train.settings import TrainSettings, apply_plan
 from tests.made.body import open_body
 from tests.made.context import RecordedContext, stage_context
 from tests.made.plans import plan_of
@@ -31,6 +31,7 @@ from tests.made.published import publish, simple_footage
 
 FRAMES, WIDTH, HEIGHT = 6, 48, 64
 TINY = TrainSettings(
+    representation="triplane",
     iterations=12,
     held_out_every=6,
     held_out_frames=1,
@@ -45,6 +46,8 @@ TINY = TrainSettings(
     gate_every=2,
     residual_from=0.3,
     face=0.8,
+    lpips=0.0,
+    lpips_from=0.0,
 )
 
 
@@ -140,7 +143,7 @@ def data_for(context: RecordedContext) -> TrainingData:
 def trainer_for(context: RecordedContext) -> Trainer:
     """A trainer as the stage builds it under a context; hooks that write files are not among its hooks."""
     plan = read_plan(context.inputs["plan"] / "plan.json")
-    settings = apply_representation(apply_plan(context.settings, plan))
+    settings = apply_plan(context.settings, plan)
     return build_trainer(data_for(context), settings)
 
 
