@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel
+from pipeline.numba_kernels import checked_kernel, checked_parallel_kernel, inline_kernel
 
 CHUNKS = 16  # of points; sums over points are added up chunk by chunk, whatever the number of threads
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -186,7 +186,7 @@ class Frame(NamedTuple):
     moved: np.ndarray
 
 
-@inline_kernel
+@checked_kernel
 def _add_up_bases(bases, row, signal, answer):
     """The six sums of a row's bases, each times its number of the signal."""
     count = len(signal)
@@ -197,7 +197,7 @@ def _add_up_bases(bases, row, signal, answer):
         answer[k] = total
 
 
-@inline_kernel
+@checked_kernel
 def _blend_few(transforms, joints, weights, point, blended):
     """As ``_blend``; joints are in the order of their weights, so that the first of zero ends it."""
     for k in range(12):
@@ -210,7 +210,7 @@ def _blend_few(transforms, joints, weights, point, blended):
             blended[k] += weight * transforms[joint, k]
 
 
-@inline_kernel
+@checked_kernel
 def _clamped(value, low, high):
     """As ``torch.clamp``: what is not a number stays as it is."""
     if value < low:
@@ -218,6 +218,69 @@ def _clamped(value, low, high):
     if value > high:
         return high
     return value
+
+
+@checked_kernel
+def _write(row, values, point):
+    for k in range(3):
+        values[point, k] = row[k]
+
+
+@checked_kernel
+def _shape(still, learnt, frame, point, answer, moves, shape):
+    """A point before skinning: rest shape, static offset, expression, and the bases' offset."""
+    place = still.places[point]
+    for k in range(3):
+        moves[point, k] = answer[3 + k] * still.movable[point]
+        value = still.points[point, k] + moves[point, k]
+        if len(learnt.offset):
+            value += learnt.offset[point, k]
+        if place >= 0:
+            value += frame.moved[place, k]
+        shape[k] = value
+
+
+@checked_kernel
+def _look(still, learnt, point, answer, scales, colors, color_logit):
+    """A point's scales and colours."""
+    low, high, largest = still.limits[0], still.limits[1], still.limits[2]
+    for k in range(3):
+        logit = learnt.color_logit[point, k] + answer[k]
+        color_logit[point, k], colors[point, k] = logit, ONE / (ONE + np.exp(-logit))
+        scale = still.initial[point, k] * np.exp(_clamped(learnt.log_scale[point, k], low, high))
+        scales[point, k] = largest if scale > largest else scale
+
+
+@checked_kernel
+def _place(blended, shape, frame_at_rest, transl, point, means, turned):
+    """A point in the world, and the turned axes of its Gaussian."""
+    for row in range(3):
+        value = blended[4 * row + 3] + transl[row]
+        for column in range(3):
+            value += blended[4 * row + column] * shape[column]
+            total = ZERO
+            for k in range(3):
+                total += blended[4 * row + k] * frame_at_rest[k, column]
+            turned[row, column] = total
+        means[point, row] = value
+
+
+@checked_kernel
+def _pose_points(
+    first, end, still, learnt, frame, means, quaternions, scales, colors, color_logit, moves, shapes
+):
+    own_rows, kept = len(learnt.rows) == 0, len(shapes) > 0
+    blended, turned = np.empty(12, np.float32), np.empty((3, 3), np.float32)
+    shape, answer = np.empty(3, np.float32), np.empty(6, np.float32)
+    for i in range(first, end):
+        _add_up_bases(learnt.bases, i if own_rows else learnt.rows[i], frame.signal, answer)
+        _shape(still, learnt, frame, i, answer, moves, shape)
+        _look(still, learnt, i, answer, scales, colors, color_logit)
+        if kept:
+            _write(shape, shapes, i)
+        _blend_few(frame.transforms, still.joints, still.weights, i, blended)
+        _place(blended, shape, still.frames[i], frame.transl, i, means, turned)
+        _write_quaternion(turned, quaternions[i])
 
 
 @checked_parallel_kernel
@@ -233,41 +296,14 @@ def pose_forward(still, learnt, frame, means, quaternions, scales, colors, color
         moves: output [N, 3], the pose-dependent offsets, metres.
         shapes: output [N, 3], what is skinned, metres; [0, 3] where nobody asks for it.
     """
+    # Outputs are no named tuple: numba takes what is only written in one for dead in a parallel loop.
     count = still.points.shape[0]
     step = (count + CHUNKS - 1) // CHUNKS
-    own_rows, offsets, kept = len(learnt.rows) == 0, len(learnt.offset) > 0, len(shapes) > 0
-    low, high, largest = still.limits[0], still.limits[1], still.limits[2]
     for chunk in numba.prange(CHUNKS):
-        blended, turned = np.empty(12, np.float32), np.empty((3, 3), np.float32)
-        shape, answer = np.empty(3, np.float32), np.empty(6, np.float32)
-        for i in range(chunk * step, min(count, (chunk + 1) * step)):
-            _add_up_bases(learnt.bases, i if own_rows else learnt.rows[i], frame.signal, answer)
-            place = still.places[i]
-            for k in range(3):
-                logit, move = learnt.color_logit[i, k] + answer[k], answer[3 + k] * still.movable[i]
-                color_logit[i, k], moves[i, k] = logit, move
-                colors[i, k] = ONE / (ONE + np.exp(-logit))
-                scale = still.initial[i, k] * np.exp(_clamped(learnt.log_scale[i, k], low, high))
-                scales[i, k] = largest if scale > largest else scale
-                shape[k] = still.points[i, k]
-                if offsets:
-                    shape[k] += learnt.offset[i, k]
-                if place >= 0:
-                    shape[k] += frame.moved[place, k]
-                shape[k] += move
-                if kept:
-                    shapes[i, k] = shape[k]
-            _blend_few(frame.transforms, still.joints, still.weights, i, blended)
-            for row in range(3):
-                value = blended[4 * row + 3] + frame.transl[row]
-                for column in range(3):
-                    value += blended[4 * row + column] * shape[column]
-                    total = ZERO
-                    for k in range(3):
-                        total += blended[4 * row + k] * still.frames[i, k, column]
-                    turned[row, column] = total
-                means[i, row] = value
-            _write_quaternion(turned, quaternions[i])
+        first, end = chunk * step, min(count, (chunk + 1) * step)
+        _pose_points(
+            first, end, still, learnt, frame, means, quaternions, scales, colors, color_logit, moves, shapes
+        )
 
 
 class Pushed(NamedTuple):
@@ -280,9 +316,20 @@ class Pushed(NamedTuple):
     moves: np.ndarray
 
 
-@inline_kernel
-def _push_joints(push, shape, joints, weights, point, sums):
-    """Adds a point's share to the gradient of the joints' transforms."""
+@checked_kernel
+def _read(values, point, row):
+    """Copies a point's row, zeros where there are no values; returns True where any of it is not zero."""
+    there = len(values) > 0
+    for k in range(3):
+        row[k] = values[point, k] if there else ZERO
+    return row[0] != 0 or row[1] != 0 or row[2] != 0
+
+
+@checked_kernel
+def _push_joints(push, shape, joints, weights, point, sums, total):
+    """Adds a point's share to the gradient of the joints' transforms, and to that of the translation."""
+    for row in range(3):
+        total[row] += push[row]
     for place in range(joints.shape[1]):
         weight, joint = weights[point, place], joints[point, place]
         if weight == 0:
@@ -292,6 +339,64 @@ def _push_joints(push, shape, joints, weights, point, sums):
             for column in range(3):
                 sums[joint, 4 * row + column] += value * shape[point, column]
             sums[joint, 4 * row + 3] += value
+
+
+@checked_kernel
+def _turn_back(blended, push):
+    """Turns the gradient of a posed point into that of the point at rest, in place."""
+    x, y, z = push[0], push[1], push[2]
+    for k in range(3):
+        push[k] = blended[k] * x + blended[4 + k] * y + blended[8 + k] * z
+
+
+@checked_kernel
+def _push_scales(still, log_scales, scales, pushed, point, g_log_scale):
+    """Writes the gradient of a point's log scales; there is none where the scale was clamped."""
+    low, high, largest = still.limits[0], still.limits[1], still.limits[2]
+    for k in range(3):
+        scale, log_scale = scales[point, k], log_scales[point, k]
+        free = scale < largest and log_scale >= low and log_scale <= high
+        g_log_scale[point, k] = pushed[k] * scale if free else ZERO
+
+
+@checked_kernel
+def _push_bases(answer, signal, row, g_bases):
+    """Writes the gradient of a row of bases, from that of their six sums."""
+    count = len(signal)
+    for k in range(6):
+        for b in range(count):
+            g_bases[row, k * count + b] = answer[k] * signal[b]
+
+
+@checked_kernel
+def _push_points(
+    first, end, still, learnt, frame, scales, colors, shapes, pushed,
+    g_offset, g_log_scale, g_color_logit, g_bases, g_transforms, g_transl, g_moved,
+):  # fmt: skip
+    """``pose_backward`` for the points [first, end), with their share of the gradient of the pose."""
+    own_rows, pose_asked = len(learnt.rows) == 0, len(shapes) > 0
+    blended, push, more = np.empty(12, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    answer = np.empty(6, np.float32)
+    for i in range(first, end):
+        if _read(pushed.means, i, push):
+            _blend_few(frame.transforms, still.joints, still.weights, i, blended)
+            if pose_asked:
+                _push_joints(push, shapes, still.joints, still.weights, i, g_transforms, g_transl)
+            _turn_back(blended, push)
+        _write(push, g_offset, i)
+        if pose_asked and still.places[i] >= 0:
+            _write(push, g_moved, still.places[i])
+        _read(pushed.moves, i, more)
+        for k in range(3):
+            answer[3 + k] = (push[k] + more[k]) * still.movable[i]
+        _read(pushed.colors, i, push)
+        _read(pushed.color_logit, i, more)
+        for k in range(3):
+            answer[k] = push[k] * colors[i, k] * (ONE - colors[i, k]) + more[k]
+            g_color_logit[i, k] = answer[k]
+        _read(pushed.scales, i, push)
+        _push_scales(still, learnt.log_scale, scales, push, i, g_log_scale)
+        _push_bases(answer, frame.signal, i if own_rows else learnt.rows[i], g_bases)
 
 
 @checked_parallel_kernel
@@ -310,51 +415,11 @@ def pose_backward(
         g_transforms, g_transl: outputs [CHUNKS, 55, 12] and [CHUNKS, 3], added to, chunk by chunk.
         g_moved: output [P, 3].
     """
-    count, directions = still.points.shape[0], len(frame.signal)
+    count = still.points.shape[0]
     step = (count + CHUNKS - 1) // CHUNKS
-    own_rows, pose_asked = len(learnt.rows) == 0, len(shapes) > 0
-    to_means, to_scales, to_colors = len(pushed.means) > 0, len(pushed.scales) > 0, len(pushed.colors) > 0
-    to_logit, to_moves = len(pushed.color_logit) > 0, len(pushed.moves) > 0
-    low, high, largest = still.limits[0], still.limits[1], still.limits[2]
     for chunk in numba.prange(CHUNKS):
-        blended, push = np.empty(12, np.float32), np.empty(3, np.float32)
-        answer = np.empty(6, np.float32)
-        for i in range(chunk * step, min(count, (chunk + 1) * step)):
-            row, place, unit = i if own_rows else learnt.rows[i], still.places[i], still.movable[i]
-            reached = False
-            for k in range(3):
-                push[k] = pushed.means[i, k] if to_means else ZERO
-                reached = reached or push[k] != 0
-            if reached:
-                _blend_few(frame.transforms, still.joints, still.weights, i, blended)
-                if pose_asked:
-                    for k in range(3):
-                        g_transl[chunk, k] += push[k]
-                    sums = g_transforms[chunk]
-                    _push_joints(push, shapes, still.joints, still.weights, i, sums)
-            for k in range(3):
-                value = ZERO
-                if reached:
-                    value = blended[k] * push[0] + blended[4 + k] * push[1] + blended[8 + k] * push[2]
-                g_offset[i, k] = value
-                if pose_asked and place >= 0:
-                    g_moved[place, k] = value
-                if to_moves:
-                    value += pushed.moves[i, k]
-                answer[3 + k] = value * unit
-                value = ZERO
-                if to_colors:
-                    color = colors[i, k]
-                    value = pushed.colors[i, k] * color * (ONE - color)
-                if to_logit:
-                    value += pushed.color_logit[i, k]
-                g_color_logit[i, k] = answer[k] = value
-                value = ZERO
-                if to_scales:
-                    scale, log_scale = scales[i, k], learnt.log_scale[i, k]
-                    if scale < largest and log_scale >= low and log_scale <= high:
-                        value = pushed.scales[i, k] * scale
-                g_log_scale[i, k] = value
-            for k in range(6):
-                for b in range(directions):
-                    g_bases[row, k * directions + b] = answer[k] * frame.signal[b]
+        first, end = chunk * step, min(count, (chunk + 1) * step)
+        _push_points(
+            first, end, still, learnt, frame, scales, colors, shapes, pushed,
+            g_offset, g_log_scale, g_color_logit, g_bases, g_transforms[chunk], g_transl[chunk], g_moved,
+        )  # fmt: skip
