@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from pipeline.numba_kernels import checked_kernel, checked_parallel_kernel, inline_kernel
+from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, kernel, parallel_kernel
 
 CHUNKS = 16  # of points; sums over points are added up chunk by chunk, whatever the number of threads
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -186,23 +186,25 @@ class Frame(NamedTuple):
     moved: np.ndarray
 
 
-@checked_kernel
+@kernel
 def _add_up_bases(bases, row, signal, answer):
     """The six sums of a row's bases, each times its number of the signal."""
-    count = len(signal)
+    count = np.uint64(len(signal))
+    first = np.uint64(0)
     for k in range(6):
         total = ZERO
         for b in range(count):
-            total += bases[row, k * count + b] * signal[b]
+            total += bases[row, first + b] * signal[b]
         answer[k] = total
+        first += count
 
 
-@checked_kernel
+@kernel
 def _blend_few(transforms, joints, weights, point, blended):
     """As ``_blend``; joints are in the order of their weights, so that the first of zero ends it."""
     for k in range(12):
         blended[k] = ZERO
-    for place in range(joints.shape[1]):
+    for place in range(np.uint64(joints.shape[1])):
         weight, joint = weights[point, place], joints[point, place]
         if weight == 0:
             break
@@ -210,7 +212,7 @@ def _blend_few(transforms, joints, weights, point, blended):
             blended[k] += weight * transforms[joint, k]
 
 
-@checked_kernel
+@kernel
 def _clamped(value, low, high):
     """As ``torch.clamp``: what is not a number stays as it is."""
     if value < low:
@@ -220,13 +222,13 @@ def _clamped(value, low, high):
     return value
 
 
-@checked_kernel
+@kernel
 def _write(row, values, point):
     for k in range(3):
         values[point, k] = row[k]
 
 
-@checked_kernel
+@kernel
 def _shape(still, learnt, frame, point, answer, moves, shape):
     """A point before skinning: rest shape, static offset, expression, and the bases' offset."""
     place = still.places[point]
@@ -236,11 +238,11 @@ def _shape(still, learnt, frame, point, answer, moves, shape):
         if len(learnt.offset):
             value += learnt.offset[point, k]
         if place >= 0:
-            value += frame.moved[place, k]
+            value += frame.moved[np.uint64(place), k]
         shape[k] = value
 
 
-@checked_kernel
+@kernel
 def _look(still, learnt, point, answer, scales, colors, color_logit):
     """A point's scales and colours."""
     low, high, largest = still.limits[0], still.limits[1], still.limits[2]
@@ -251,7 +253,7 @@ def _look(still, learnt, point, answer, scales, colors, color_logit):
         scales[point, k] = largest if scale > largest else scale
 
 
-@checked_kernel
+@kernel
 def _place(blended, shape, frame_at_rest, transl, point, means, turned):
     """A point in the world, and the turned axes of its Gaussian."""
     for row in range(3):
@@ -265,15 +267,15 @@ def _place(blended, shape, frame_at_rest, transl, point, means, turned):
         means[point, row] = value
 
 
-@checked_kernel
+@kernel
 def _pose_points(
     first, end, still, learnt, frame, means, quaternions, scales, colors, color_logit, moves, shapes
 ):
     own_rows, kept = len(learnt.rows) == 0, len(shapes) > 0
     blended, turned = np.empty(12, np.float32), np.empty((3, 3), np.float32)
     shape, answer = np.empty(3, np.float32), np.empty(6, np.float32)
-    for i in range(first, end):
-        _add_up_bases(learnt.bases, i if own_rows else learnt.rows[i], frame.signal, answer)
+    for i in range(np.uint64(first), np.uint64(end)):  # unsigned: it does not count from the end
+        _add_up_bases(learnt.bases, i if own_rows else np.uint64(learnt.rows[i]), frame.signal, answer)
         _shape(still, learnt, frame, i, answer, moves, shape)
         _look(still, learnt, i, answer, scales, colors, color_logit)
         if kept:
@@ -283,7 +285,7 @@ def _pose_points(
         _write_quaternion(turned, quaternions[i])
 
 
-@checked_parallel_kernel
+@parallel_kernel
 def pose_forward(still, learnt, frame, means, quaternions, scales, colors, color_logit, moves, shapes):
     """Bases, expression, skinning, scales and colours of one frame in one pass over the Gaussians.
 
@@ -316,7 +318,7 @@ class Pushed(NamedTuple):
     moves: np.ndarray
 
 
-@checked_kernel
+@kernel
 def _read(values, point, row):
     """Copies a point's row, zeros where there are no values; returns True where any of it is not zero."""
     there = len(values) > 0
@@ -325,12 +327,12 @@ def _read(values, point, row):
     return row[0] != 0 or row[1] != 0 or row[2] != 0
 
 
-@checked_kernel
+@kernel
 def _push_joints(push, shape, joints, weights, point, sums, total):
     """Adds a point's share to the gradient of the joints' transforms, and to that of the translation."""
     for row in range(3):
         total[row] += push[row]
-    for place in range(joints.shape[1]):
+    for place in range(np.uint64(joints.shape[1])):
         weight, joint = weights[point, place], joints[point, place]
         if weight == 0:
             break
@@ -341,7 +343,7 @@ def _push_joints(push, shape, joints, weights, point, sums, total):
             sums[joint, 4 * row + 3] += value
 
 
-@checked_kernel
+@kernel
 def _turn_back(blended, push):
     """Turns the gradient of a posed point into that of the point at rest, in place."""
     x, y, z = push[0], push[1], push[2]
@@ -349,7 +351,7 @@ def _turn_back(blended, push):
         push[k] = blended[k] * x + blended[4 + k] * y + blended[8 + k] * z
 
 
-@checked_kernel
+@kernel
 def _push_scales(still, log_scales, scales, pushed, point, g_log_scale):
     """Writes the gradient of a point's log scales; there is none where the scale was clamped."""
     low, high, largest = still.limits[0], still.limits[1], still.limits[2]
@@ -359,16 +361,18 @@ def _push_scales(still, log_scales, scales, pushed, point, g_log_scale):
         g_log_scale[point, k] = pushed[k] * scale if free else ZERO
 
 
-@checked_kernel
+@kernel
 def _push_bases(answer, signal, row, g_bases):
     """Writes the gradient of a row of bases, from that of their six sums."""
-    count = len(signal)
+    count = np.uint64(len(signal))
+    first = np.uint64(0)
     for k in range(6):
         for b in range(count):
-            g_bases[row, k * count + b] = answer[k] * signal[b]
+            g_bases[row, first + b] = answer[k] * signal[b]
+        first += count
 
 
-@checked_kernel
+@kernel
 def _push_points(
     first, end, still, learnt, frame, scales, colors, shapes, pushed,
     g_offset, g_log_scale, g_color_logit, g_bases, g_transforms, g_transl, g_moved,
@@ -377,7 +381,7 @@ def _push_points(
     own_rows, pose_asked = len(learnt.rows) == 0, len(shapes) > 0
     blended, push, more = np.empty(12, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     answer = np.empty(6, np.float32)
-    for i in range(first, end):
+    for i in range(np.uint64(first), np.uint64(end)):  # unsigned: it does not count from the end
         if _read(pushed.means, i, push):
             _blend_few(frame.transforms, still.joints, still.weights, i, blended)
             if pose_asked:
@@ -385,7 +389,7 @@ def _push_points(
             _turn_back(blended, push)
         _write(push, g_offset, i)
         if pose_asked and still.places[i] >= 0:
-            _write(push, g_moved, still.places[i])
+            _write(push, g_moved, np.uint64(still.places[i]))
         _read(pushed.moves, i, more)
         for k in range(3):
             answer[3 + k] = (push[k] + more[k]) * still.movable[i]
@@ -396,10 +400,10 @@ def _push_points(
             g_color_logit[i, k] = answer[k]
         _read(pushed.scales, i, push)
         _push_scales(still, learnt.log_scale, scales, push, i, g_log_scale)
-        _push_bases(answer, frame.signal, i if own_rows else learnt.rows[i], g_bases)
+        _push_bases(answer, frame.signal, i if own_rows else np.uint64(learnt.rows[i]), g_bases)
 
 
-@checked_parallel_kernel
+@parallel_kernel
 def pose_backward(
     still, learnt, frame, scales, colors, shapes, pushed,
     g_offset, g_log_scale, g_color_logit, g_bases, g_transforms, g_transl, g_moved,
