@@ -69,6 +69,8 @@ class Avatar(nn.Module):
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
+        at_once: posed in one pass over the Gaussians where that can be (``fused_posing.py``), else step by
+            step, which gives the same.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
     """
@@ -106,6 +108,7 @@ class Avatar(nn.Module):
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
+        self.at_once = True
         self.splits = tuple(splits)
         if self.splits:
             meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
@@ -239,7 +242,13 @@ class Avatar(nn.Module):
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         condition = Condition(theta, pose.expression, time)
-        if rows is None and posed_at_once(decoded):
+        # One pass computes on a CPU, for all Gaussians, and knows no pose correctives.
+        if (
+            self.at_once
+            and rows is None
+            and canonical.pose_directions is None
+            and kernels_serve(decoded.offset)
+        ):
             linear = self.representation.linear_change(decoded, condition)
             if linear is not None:
                 return self._pose_at_once(decoded, linear, transforms, pose)
@@ -397,11 +406,6 @@ def pose_features(rotation: Tensor) -> Tensor:
     """
     matrices = roma.rotvec_to_rotmat(rotation[1:])
     return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
-
-
-def posed_at_once(decoded: Decoded) -> bool:
-    """True where one pass over the Gaussians can pose them: on a CPU, on a body without pose correctives."""
-    return kernels_serve(decoded.offset) and decoded.surface.canonical.pose_directions is None
 
 
 def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:
