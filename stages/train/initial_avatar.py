@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.density import choose_splits, project_surface
 from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
 from pipeline.device import moved
@@ -20,6 +21,8 @@ from stages.train.initial_colors import initial_color_logits
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import ever_in_frame
+
+DENSITY_FRAMES = 12  # training frames, evenly spread, in which edges are measured
 
 
 def initial_avatar(
@@ -47,7 +50,9 @@ def initial_avatar(
     rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
     clip, conditions = data.clip, clip_conditions(data)
     sizes = architecture(settings, conditions, clip.body.expression_directions.shape[-1])
-    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, settings.half_precision)
+    splits = splits_of(data, refinement, rows, settings)
+    half = settings.half_precision
+    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, half, splits)
     avatar.to(refinement.poses.rotation.device)
     avatar.pose_heads_active = avatar.residuals_active = False
     avatar.representation.set_clip(moved(conditions, avatar.device))
@@ -83,6 +88,19 @@ def kept_vertices(data: TrainingData, refinement: PoseRefinement, settings: Trai
         return torch.ones(len(seen), dtype=torch.bool)
     # The rings are what offsets and refined poses may bring in.
     return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
+
+
+def splits_of(
+    data: TrainingData, refinement: PoseRefinement, vertex_ids: Tensor, settings: TrainSettings
+) -> tuple[Tensor, ...]:
+    """The edges that are split before training, see ``pipeline.avatar.density``; none for a triplane."""
+    if settings.representation == "triplane" or not settings.edge_pixels:
+        return ()
+    clip = data.clip
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    surface = Avatar(clip.body, clip.identity, vertex_ids, bare).surfaces[0]
+    frames = [(clip.pose(frame), data.crops.camera(frame)) for frame in clip.spread(DENSITY_FRAMES)]
+    return choose_splits(surface.canonical.faces, project_surface(surface, frames), settings.edge_pixels)
 
 
 def clip_conditions(data: TrainingData) -> ClipConditions:

@@ -63,7 +63,7 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     trainer = build_trainer(data, settings, device, network, log)
     context.timing("prepare_seconds", time.monotonic() - started)
     log(describe_objective(settings))
-    levels = range(settings.subdivisions + 1)
+    levels = range(len(trainer.avatar.surfaces))
     costs = step_costs(settings, [len(trainer.avatar.surface(level).canonical) for level in levels])
     with context.progress(settings.iterations, "training", costs) as progress:
         curve, timer = add_run_hooks(trainer, context.work, compiled, log)

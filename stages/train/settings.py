@@ -73,6 +73,9 @@ class TrainSettings:
     bases: BasesCount = setting(
         8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
     )
+    edge_pixels: Annotated[float, Field(ge=0, le=1000)] = setting(
+        2.5, "of the bases: edges longer than this in a training frame are split; 0: subdivisions as given"
+    )
     subdivisions: Levels = setting(1, "levels of midpoint subdivision")
     subdivide_from: Fraction = setting(0.5, "fraction of the run before which the mesh stays unsubdivided")
     plane_resolution: Texels = setting(128, "texels along a side of each plane")
@@ -226,6 +229,7 @@ def apply_representation(settings: TrainSettings) -> TrainSettings:
         return settings
     return dataclasses.replace(
         settings,
+        subdivisions=0 if settings.edge_pixels else settings.subdivisions,
         subdivide_from=0.0,
         pose_heads_from=0.0 if settings.bases else 1.0,
         pose_seen_only=False,
