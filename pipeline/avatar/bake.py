@@ -14,7 +14,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features, scaled_residual
 from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
@@ -34,6 +34,7 @@ class Constants:
         log_scale, color_logit: [N, 3], of the static heads.
         offset_unit: [N, 1], metres that a pose-dependent offset of 1 stands for.
         joints: [55, 3], metres.
+        pose_share: [N, 2], the share of what follows the pose that is shown of colour and shape; None for all.
     """
 
     points: Tensor
@@ -45,6 +46,7 @@ class Constants:
     color_logit: Tensor
     offset_unit: Tensor
     joints: Tensor
+    pose_share: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,12 +93,16 @@ class BakedAvatar:
         log_scale, color_logit = constants.log_scale, constants.color_logit
         condition, rest = Condition(theta, pose.expression, time), points
         change = self.representation.change(condition, lambda: self.skinning_tables.normals(transforms, rest))
+        share = constants.pose_share
         if change is not None:
+            change = change if share is None else change.scaled(share)
             points = torch.addcmul(points, change.offset, constants.offset_unit)
             log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
             color_logit = color_logit + change.color_logit
         means, quaternions = self.skinning_tables.place(transforms, points, pose.transl)
         answers = self.representation.residuals(means, condition)
+        if share is not None:
+            answers = [(rows, scaled_residual(answer, share[rows])) for rows, answer in answers]
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
@@ -156,4 +162,5 @@ def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
         color_logit=decoded.color_logit.contiguous(),
         offset_unit=sizes.pose_offset_unit * decoded.surface.pose_movable,
         joints=canonical.joints,
+        pose_share=avatar.pose_share(decoded.surface),
     )

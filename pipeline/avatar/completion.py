@@ -42,37 +42,38 @@ def complete_color_logits(surface: Surface, evidence: Evidence) -> Tensor:
 
 
 @torch.no_grad()
-def complete_avatar(avatar: Avatar, evidence: Evidence, trust: Tensor | None = None) -> None:
+def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
     """Completes an avatar in place; to be called once, after training.
 
     Args:
         avatar: trained.
         evidence: of its ungated Gaussians, N.
-        trust: [N] in [0, 1]; the evidence's if None.
     """
-    decoded, trust = avatar.decode(), evidence.trust if trust is None else trust
+    decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
+    trust = torch.stack([evidence.trust, evidence.shape_trust], 1)
     avatar.trust.index_copy_(0, rows, trust.to(avatar.trust))
     if bool((trust == 1).all()):
         return
-    avatar.take_completion(rows, completed_values(decoded, evidence, trust))
+    avatar.take_completion(rows, completed_values(decoded, evidence))
 
 
-def completed_values(decoded: Decoded, evidence: Evidence, trust: Tensor) -> Decoded:
+def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
     """What was decoded with colour, offset and scale completed."""
     segments = surface_segments(decoded.surface)
-    color, offset, log_scale, sure, normals = (
+    color, offset, log_scale, trust, shape_trust, normals = (
         one.detach().double().cpu().numpy()
         for one in (
-            torch.sigmoid(decoded.color_logit), decoded.offset, decoded.log_scale, trust, evidence.normals,
+            torch.sigmoid(decoded.color_logit), decoded.offset, decoded.log_scale, evidence.trust,
+            evidence.shape_trust, evidence.normals,
         )
     )  # fmt: skip
-    found = torch.from_numpy(complete_colors(segments, color, sure, normals))
-    logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(decoded.color_logit)
-    like, kept = decoded.offset, (trust == 1)[:, None]
+    like = decoded.offset
+    found = torch.from_numpy(complete_colors(segments, color, trust, normals))
+    logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
     return dataclasses.replace(
         decoded,
-        color_logit=torch.where(kept, decoded.color_logit, logits),
-        offset=torch.from_numpy(complete_offsets(segments, offset, color, sure)).to(like),
-        log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, sure)).to(like),
+        color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
+        offset=torch.from_numpy(complete_offsets(segments, offset, shape_trust)).to(like),
+        log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, shape_trust)).to(like),
     )

@@ -22,16 +22,17 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.surface import Surface
-from pipeline.body import vertex_normals
+from pipeline.body.mesh import face_normals, vertex_normals
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.views import View
 from pipeline.splat import Gaussians, render
 
-GRAZING, SQUARE = 0.15, 0.5  # cosines: nothing is learnt, all is learnt
-LEAST_ALPHA = 0.5 + 0.125**0.5  # above which a pixel counts: 4 a (1 - a), the mask's variance, is under 1/2
+GRAZING, SQUARE = 0.0, 0.2  # cosines: nothing is learnt, all is learnt
+PERSON = 0.2, 0.7  # alpha: a pixel does not count, counts wholly
 LEAST_TRUST = 0.5  # from which a pixel of a generated frame counts
-HIDDEN, OPEN = 0.1, 0.5  # shares: what shines through from behind, what is plainly seen
+HIDDEN, OPEN = 0.05, 0.3  # shares: what shines through from behind, what is plainly seen
 DOUBTED, TRUSTED = 0.01, 0.12  # mean over the frames: of a few frames in hundreds, and of one in eight
+EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
 SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
 
 
@@ -40,8 +41,8 @@ class Evidence:
     """The evidence that some frames give of each of N Gaussians.
 
     Attributes:
-        seen: [N] in [0, 1], mean over the frames of share and squareness together; what trust is made of.
-        frames: [N] in [0, 1], the part of the frames that showed it at all.
+        seen: [N] in [0, 1], mean over the frames of share and squareness together.
+        frames: [N] in [0, 1], the part of the frames that showed it at all: the mean share.
         facing: [N] in [0, 1], the mean cosine in the frames that showed it; 0 where none did.
         color: [N, 3], its mean colour in them, RGB in [0, 1]; meaningless where ``seen`` is 0.
         normals: [N, 3], its mean normal in the world over all the frames; short where the body turned.
@@ -55,8 +56,13 @@ class Evidence:
 
     @property
     def trust(self) -> Tensor:
-        """How far what was learnt of each Gaussian is to be believed, [N] in [0, 1]."""
+        """How far the colour that was learnt of each Gaussian is to be believed, [N] in [0, 1]."""
         return ramp(self.seen, DOUBTED, TRUSTED)
+
+    @property
+    def shape_trust(self) -> Tensor:
+        """How far its place and size are, [N] in [0, 1]: also what a silhouette showed from its edge."""
+        return ramp(self.frames, DOUBTED, TRUSTED)
 
 
 def ramp(values: Tensor, low: float, high: float) -> Tensor:
@@ -107,15 +113,13 @@ def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Ten
     cosine = (normals * towards).sum(1).clamp(0, 1)
     weighed = dataclasses.replace(gaussians, colors=gaussians.colors.detach().clone().requires_grad_())
     image = render(weighed, view.camera).color
-    # All or nothing: a mean does not feel a small weight that all of its members share.
-    person = view.alpha > LEAST_ALPHA
+    counts = ramp(view.alpha, *PERSON)[..., None]
     if view.trust is not None:
-        person &= view.trust >= LEAST_TRUST
-    counts = person.to(image.dtype)[..., None]
+        counts = counts * (view.trust >= LEAST_TRUST)[..., None]
     color = torch.autograd.grad((image * view.color * counts).sum(), weighed.colors, retain_graph=True)[0]
     weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, 0]
     share = weight / covered.clamp_min(SMALLEST)
-    showed = ramp(share, HIDDEN, OPEN) * (covered > SMALLEST)
+    showed = ramp(share, HIDDEN, OPEN)
     seen = showed * ramp(cosine, GRAZING, SQUARE)
     return seen, showed, showed * cosine, color / weight.clamp_min(1e-12)[:, None] * seen[:, None], normals
 
@@ -127,8 +131,8 @@ def covered_pixels(
 ) -> Tensor:
     """The pixels that each point's piece of the surface covers, [N], if nothing stands before it.
 
-    A point's piece is a third of each triangle around it. What faces away covers nothing, as does what a
-    camera does not have before it.
+    A point's piece is a third of each triangle around it, whichever way it faces. A piece that is seen from
+    its edge covers a little, too: Gaussians are not flat.
 
     Args:
         camera: that looks.
@@ -138,9 +142,10 @@ def covered_pixels(
     pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
     a, b, c = (pixels[faces[:, corner]] for corner in range(3))
     ab, ac = b - a, c - a
-    # Rows count downwards: a triangle that faces the camera runs the other way round in the picture.
-    area = -(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]) / 2
-    area = torch.where((depth[faces] > 0).all(1), area, torch.zeros_like(area)).clamp_min(0)
+    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / 2
+    scale = (camera.intrinsics[0, 0] / depth[faces].mean(1).clamp_min(1e-2)) ** 2
+    area = torch.maximum(area, EDGE_ON * scale * face_normals(points, faces).norm(dim=1) / 2)
+    area = torch.where((depth[faces] > 0).all(1), area, torch.zeros_like(area))
     pieces = torch.zeros_like(depth)
     for corner in range(3):
         pieces.index_add_(0, faces[:, corner], area / 3)

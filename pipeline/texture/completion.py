@@ -29,6 +29,7 @@ REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
 RINGS = ((0.012, 1.0), (0.05, 1e-3), (10.0, 1e-6))  # widths along a limb, metres, and what each counts
 BIN = 0.004  # metres along a limb
 FIRM = 50.0  # how firmly a wholly trusted vertex is held, against an edge's 1
+LEFT = 0.05  # how firmly what training has left of an untrusted offset is held: smoothed over a few edges
 SKIN_LIKE = 0.13  # distance of two colours, in [0, 1], at which they are hardly of one kind
 LEAST_SOURCE = 0.02  # what the skin's own colour still counts as a source of hair or cloth
 DARK = 4.0 / 255  # mean colour: logarithms below say nothing
@@ -67,18 +68,18 @@ def complete_colors(
 def complete_offsets(
     segments: Segments,
     offset: np.ndarray,  # [N, 3]
-    color: np.ndarray,  # [N, 3]
     trust: np.ndarray,  # [N]
 ) -> np.ndarray:
     """An offset at rest for every vertex, metres: [N, 3] float64.
 
-    The part along the normal, how far hair and cloth stand off, is what is guessed; ``color`` tells hair from
-    skin as in ``complete_colors``.
+    Where it is not trusted it is smooth and not guessed: what no frame shows must still stay behind the
+    silhouettes that frames do show, and training has drawn it there.
     """
-    source = spreading(segments, color, trust)
-    outward = (segments.normals * offset).sum(1, keepdims=True)
-    guessed = guess(segments, outward, source) * segments.normals
-    return completed(segments, offset, guessed, trust, source)
+    trust = np.clip(trust, 0, 1)
+    hold, sink = np.maximum(_hold(trust), LEFT), np.full(len(segments), 1e-9)
+    smooth = screened_membrane(neighbours(segments.edges, len(segments)), offset, hold, sink)
+    share = trust[:, None]
+    return np.where(share == 1, offset, share * offset + (1 - share) * smooth)
 
 
 def complete_log_scales(
@@ -110,13 +111,17 @@ def completed(
     share = np.clip(trust, 0, 1)[:, None].astype(np.float64)
     if (share == 1).all():
         return values.copy()
-    hold = FIRM * source**2 / (1 - source + 1e-2)
+    hold = _hold(source)
     reach = np.array([REACH.get(label, REACH[BODY]) for label in range(segments.label.max() + 1)])
     sink = np.maximum((segments.spacing / reach[segments.label]) ** 2, 1e-6)
     difference = np.where(source[:, None] > 0, values - guessed, 0)
     bent = screened_membrane(neighbours(segments.edges, len(segments)), difference, hold, sink)
     mixed = share * np.where(share > 0, values, 0) + (1 - share) * (guessed + bent)
     return np.where(share == 1, values, mixed)
+
+
+def _hold(trust: np.ndarray) -> np.ndarray:
+    return FIRM * trust**2 / (1 - trust + 1e-2)
 
 
 def spreading(

@@ -22,6 +22,7 @@ FACE, SCALP, NECK, BODY, LEFT_HAND, RIGHT_HAND = range(6)
 OTHER_SIDE = np.array([FACE, SCALP, NECK, BODY, RIGHT_HAND, LEFT_HAND])  # the mirror image's segment
 SKIN = (FACE, NECK, LEFT_HAND, RIGHT_HAND)
 EARS = 0.03  # metres behind the jaw's hinge, as far as the ears reach
+EAR_TOP = 0.025  # metres above the eyes, as high as the ears reach: what lies higher at the side is scalp
 _ALONG_X = ("left_arm", "right_arm", "left_hand", "right_hand")  # in T pose; all else lies along Y
 
 
@@ -101,8 +102,8 @@ def _labels(vertices: Tensor, weights: Tensor, parts: Tensor, joints: Tensor) ->
 
     face, skull = of("face"), weights[:, joint_index("head")] > 0.5
     ears = joints[joint_index("jaw"), 2] - EARS
-    top = vertices[face, 1].max() if bool(face.any()) else vertices[:, 1].max()
-    front = (vertices[:, 2] > ears) & (vertices[:, 1] < top)
+    eyes = joints[[joint_index("left_eye"), joint_index("right_eye")], 1].mean()
+    front = (vertices[:, 2] > ears) & (vertices[:, 1] < eyes + EAR_TOP)
     label = torch.full((len(vertices),), BODY)
     label[of("head")] = NECK
     label[of("head") & skull & ~front] = SCALP
