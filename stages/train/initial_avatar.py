@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
-from pipeline.avatar.density import choose_splits, project_surface
+from pipeline.avatar.density import DENSITY_FRAMES, choose_splits, project_surface
 from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
 from pipeline.device import moved
@@ -21,8 +21,6 @@ from stages.train.initial_colors import initial_color_logits
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import ever_in_frame
-
-DENSITY_FRAMES = 12  # training frames, evenly spread, in which edges are measured
 
 
 def initial_avatar(
@@ -36,7 +34,7 @@ def initial_avatar(
     Args:
         data: what it will be learnt from.
         refinement: the fitted poses.
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         log: for a line with the numbers of vertices and Gaussians.
 
     Returns:
@@ -126,7 +124,7 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
     """The part of the settings that an avatar's file has to remember; no more bases than the clip drives.
 
     Args:
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         conditions: of the training frames.
         expressions: of the body.
     """
