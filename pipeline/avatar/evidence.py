@@ -64,6 +64,17 @@ class Evidence:
         """How far its place and size are, [N] in [0, 1]: also what a silhouette showed from its edge."""
         return ramp(self.frames, DOUBTED, TRUSTED)
 
+    def filled(self, other: Evidence) -> Evidence:
+        """This evidence, and where it is weak the other's, as of generated frames beside captured ones."""
+        share = self.trust[:, None]
+        return Evidence(
+            seen=torch.maximum(self.seen, other.seen),
+            frames=torch.maximum(self.frames, other.frames),
+            facing=torch.maximum(self.facing, other.facing),
+            color=share * self.color + (1 - share) * other.color,
+            normals=self.normals,
+        )
+
 
 def ramp(values: Tensor, low: float, high: float) -> Tensor:
     """0 up to ``low``, 1 from ``high`` on, a smooth step between (``3 x^2 - 2 x^3``)."""

@@ -5,7 +5,7 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=5,
+    version=6,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={

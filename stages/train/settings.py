@@ -151,10 +151,10 @@ class TrainSettings:
         None, "scores below are gated; none: found in the scores (Otsu)"
     )
     gate_rings: Rings = setting(2, "rings of neighbours added to what is left")
-    unseen: Literal["nothing", "base", "generated"] = setting(
-        "generated",
-        "where no captured frame showed enough: nothing, base (the fitted body in the colours next to it), "
-        "or what generated frames show, and nothing where there are none",
+    unseen: Literal["completed", "generated", "base", "nothing"] = setting(
+        "completed",
+        "where no frame showed enough: completed from what frames showed of hair, cloth and skin; generated, "
+        "as training left it; nothing; base, completed, and what the gate took as the fitted body",
     )
 
     # Optimiser
