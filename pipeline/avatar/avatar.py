@@ -239,7 +239,7 @@ class Avatar(nn.Module):
         self._baked = None
 
     def pose_share(self, surface: Surface) -> Tensor | None:
-        """The share of what follows the pose that is shown of colour and shape, [N, 2]; None for all of it."""
+        """The share that is shown of what follows the pose, colour and shape, [N, 2]; None for all."""
         return surface.pick(self.trust) if len(self.completion) else None
 
     def pose(

@@ -34,7 +34,7 @@ class Constants:
         log_scale, color_logit: [N, 3], of the static heads.
         offset_unit: [N, 1], metres that a pose-dependent offset of 1 stands for.
         joints: [55, 3], metres.
-        pose_share: [N, 2], the share of what follows the pose that is shown of colour and shape; None for all.
+        pose_share: [N, 2], the share that is shown of what follows the pose, colour and shape; None for all.
     """
 
     points: Tensor

@@ -30,7 +30,7 @@ from pipeline.splat import Gaussians, render
 GRAZING, SQUARE = 0.0, 0.2  # cosines: nothing is learnt, all is learnt
 PERSON = 0.2, 0.7  # alpha: a pixel does not count, counts wholly
 LEAST_TRUST = 0.5  # from which a pixel of a generated frame counts
-HIDDEN, OPEN = 0.05, 0.3  # shares: what shines through from behind, what is plainly seen
+HIDDEN, OPEN = 0.15, 0.4  # shares: what shines through from behind, what is plainly seen
 DOUBTED, TRUSTED = 0.01, 0.12  # mean over the frames: of a few frames in hundreds, and of one in eight
 EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
 SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
@@ -111,7 +111,7 @@ def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -
 
 
 def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Tensor, ...]:
-    """One frame's part in the sums of ``Evidence``: seen, frames, facing [N], colour times seen, normals [N, 3].
+    """One frame's part in the sums of ``Evidence``: three of [N], colour times seen and normals, [N, 3].
 
     The blending weights come from the renderer's own backward pass: the derivative of
     ``sum(rendering * picture)`` with respect to a Gaussian's colour is the sum of the pixels that it covers,

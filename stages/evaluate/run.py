@@ -17,6 +17,7 @@ from pipeline.clip.curves import read_curve
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
+from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
 from pipeline.metrics import Lpips
 from pipeline.metrics.face_identity import FaceRecognizer
@@ -89,7 +90,8 @@ def run(context: Context) -> None:
     """
     settings: EvaluateSettings = context.settings
     start = time.monotonic()
-    clip = read_evaluated_clip(context.inputs, context.body_file)
+    photographed = settings.choices.edge_colors == PHOTOGRAPH
+    clip = read_evaluated_clip(context.inputs, context.body_file, photographed)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)

@@ -9,7 +9,7 @@ STAGE = Stage(
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={
-        "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json", "footage.json"),
+        "ingest": ("frames/*", "masks/*", "foreground/*", "cameras.parquet", "split.json", "footage.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
         "plan": ("plan.json",),
         "auxiliary": (
