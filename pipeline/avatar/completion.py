@@ -1,7 +1,7 @@
 """Completion of a trained avatar: what no frame showed well is taken from what frames did.
 
 After training each Gaussian keeps what was learnt as far as evidence trusts it (``evidence.py``), and has for
-the rest colour, offset and scale from its own segment of the body (``pipeline/texture/completion.py``); what
+the rest colour and scale from its own segment of the body (``pipeline/texture/completion.py``); what
 follows the pose fades out likewise. Seconds of work, no generator, and an avatar of which everything was
 seen stays as it was to the byte.
 
@@ -20,7 +20,7 @@ from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.evidence import Evidence
 from pipeline.avatar.representation import Decoded
 from pipeline.avatar.surface import Surface
-from pipeline.texture.completion import complete_colors, complete_log_scales, complete_offsets
+from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import Segments, find_segments
 
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
@@ -59,12 +59,16 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
 
 
 def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
-    """What was decoded with colour, offset and scale completed."""
+    """What was decoded with colour and scale completed.
+
+    Offsets stay: what no frame shows must keep behind the silhouettes that frames do show, and training has
+    put it there.
+    """
     segments = surface_segments(decoded.surface)
-    color, offset, log_scale, trust, shape_trust, normals = (
+    color, log_scale, trust, shape_trust, normals = (
         one.detach().double().cpu().numpy()
         for one in (
-            torch.sigmoid(decoded.color_logit), decoded.offset, decoded.log_scale, evidence.trust,
+            torch.sigmoid(decoded.color_logit), decoded.log_scale, evidence.trust,
             evidence.shape_trust, evidence.normals,
         )
     )  # fmt: skip
@@ -74,6 +78,5 @@ def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
     return dataclasses.replace(
         decoded,
         color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
-        offset=torch.from_numpy(complete_offsets(segments, offset, shape_trust)).to(like),
         log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, shape_trust)).to(like),
     )

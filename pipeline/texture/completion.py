@@ -29,7 +29,6 @@ REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
 RINGS = ((0.012, 1.0), (0.05, 1e-3), (10.0, 1e-6))  # widths along a limb, metres, and what each counts
 BIN = 0.004  # metres along a limb
 FIRM = 50.0  # how firmly a wholly trusted vertex is held, against an edge's 1
-LEFT = 0.05  # how firmly what training has left of an untrusted offset is held: smoothed over a few edges
 SKIN_LIKE = 0.13  # distance of two colours, in [0, 1], at which they are hardly of one kind
 LEAST_SOURCE = 0.02  # what the skin's own colour still counts as a source of hair or cloth
 DARK = 4.0 / 255  # mean colour: logarithms below say nothing
@@ -63,23 +62,6 @@ def complete_colors(
         shade = np.exp(shading(color, source, normals, segments.part))[:, None]
     guessed = guess(segments, color / shade, source)
     return np.clip(completed(segments, color / shade, guessed, trust, source) * shade, 0, 1)
-
-
-def complete_offsets(
-    segments: Segments,
-    offset: np.ndarray,  # [N, 3]
-    trust: np.ndarray,  # [N]
-) -> np.ndarray:
-    """An offset at rest for every vertex, metres: [N, 3] float64.
-
-    Where it is not trusted it is smooth and not guessed: what no frame shows must still stay behind the
-    silhouettes that frames do show, and training has drawn it there.
-    """
-    trust = np.clip(trust, 0, 1)
-    hold, sink = np.maximum(_hold(trust), LEFT), np.full(len(segments), 1e-9)
-    smooth = screened_membrane(neighbours(segments.edges, len(segments)), offset, hold, sink)
-    share = trust[:, None]
-    return np.where(share == 1, offset, share * offset + (1 - share) * smooth)
 
 
 def complete_log_scales(

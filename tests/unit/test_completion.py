@@ -11,7 +11,7 @@ from pipeline.avatar.bake import bake
 from pipeline.avatar.completion import complete_avatar
 from pipeline.avatar.evidence import Evidence
 from pipeline.body import Pose, load_body, mean_identity, part_labels, rest_joints
-from pipeline.texture.completion import complete_colors, complete_log_scales, complete_offsets
+from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import BODY, FACE, LEFT_HAND, NECK, RIGHT_HAND, SCALP, find_segments
 
 SKIN, HAIR, CLOTH = np.array([0.8, 0.6, 0.5]), np.array([0.12, 0.08, 0.06]), np.array([0.1, 0.3, 0.7])
@@ -103,15 +103,11 @@ def test_a_part_without_evidence_has_a_colour_all_the_same(segments, known):
 
 def test_what_is_wholly_trusted_stays_to_the_byte(segments):
     values, trust = np.random.default_rng(1).random((len(segments), 3)), np.ones(len(segments))
-    for complete in (complete_colors, complete_offsets, complete_log_scales):
+    for complete in (complete_colors, complete_log_scales):
         np.testing.assert_array_equal(complete(segments, values, trust), values)
 
 
-def test_guessed_offsets_are_smooth_and_scales_cover(segments, front):
-    noise = 0.02 * np.random.default_rng(2).standard_normal((len(segments), 3))
-    found = complete_offsets(segments, noise, front)
-    behind = segments.normals[:, 2] < 0
-    assert found[behind].std() < 0.5 * noise[behind].std()
+def test_guessed_scales_cover(segments, front):
     scales = complete_log_scales(segments, np.full((len(segments), 3), -2.0), front)
     assert (np.median(scales[segments.normals[:, 2] < -0.9]) > -0.3) and (scales[front == 1] == -2).all()
 
