@@ -141,6 +141,10 @@ def versions_of(result: Result) -> list[tuple[str, str]]:
 
 def sizes_of(settings: Settings) -> str:
     """How large and how long the base's run is, in words."""
-    iterations, side = settings["train"].iterations, setting_of(settings, picture_setting(settings["ingest"]))
-    small = "; small: a part that needs a long run shows less than it is worth" if iterations < 1000 else ""
-    return f"{iterations:,} iterations, {mesh_of(settings)}, pictures of {side} px{small}"
+    train, side = settings["train"], setting_of(settings, picture_setting(settings["ingest"]))
+    steps, small = f"{train.effort:g} times the plan's steps", ""
+    if train.iterations:
+        steps = f"{train.iterations:,} iterations"
+        small = "; small: a part that needs a long run shows less than it is worth"
+    small = small if train.iterations < 1000 else ""
+    return f"{steps}, {mesh_of(settings)}, pictures of {side} px{small}"

@@ -19,7 +19,8 @@ from pipeline.studies.variants import Settings, another_seed
 
 SUBDIVISIONS = ("no subdivision", "one subdivision", "two subdivisions")
 CHANCE = "chance"  # the parameter that buys nothing: another seed
-GAUSSIANS, PRECISION = "number of Gaussians", "precision"
+GAUSSIANS, PRECISION, REPRESENTATION = "number of Gaussians", "precision", "representation"
+EDGES = (1.5, 0.7)  # times the base's longest edge between Gaussians
 MOST_COMBINED = 6  # levels that combinations are made of: 15 pairs, 20 triples, ...
 
 
@@ -57,7 +58,8 @@ def overrides_of(design: Design) -> dict[str, str]:
 
 SCALED = (
     # parameter, its setting, factors, what the number is a multiple of, exponent of training time, in words
-    ("iterations", "train.iterations", (0.5, 2.0, 4.0), 1, 1.0, "{:,} iterations"),
+    ("steps", "train.iterations", (0.5, 2.0, 4.0), 1, 1.0, "{:,} iterations"),
+    ("steps", "train.effort", (0.5, 2.0, 4.0), 0.01, 1.0, "{:g} times the plan's steps"),
     ("image size", "", (0.5, 1.5), 8, 0.5, "{} px"),
     ("fit effort", "fit.iterations", (0.25, 2.0), 1, 0.0, "fit of {} steps"),
 )
@@ -75,12 +77,10 @@ SWITCHED = (
 
 def sweep_levels(settings: Settings) -> list[Level]:
     """Every level to try alone: each parameter's first before any parameter's second, the fastest first."""
-    half, words = settings["train"].half_precision, ("float32", "bfloat16")
-    precision = (("train.half_precision", str(not half).lower()),)
     levels = [
         *_scaled(settings),
         *_gaussians(settings),
-        Level(PRECISION, words[half], words[not half], precision, 1.5),
+        *_kinds(settings),
         *_switched(settings),
         _chance(settings),
     ]
@@ -94,8 +94,10 @@ def _scaled(settings: Settings) -> Iterator[Level]:
     for parameter, name, factors, multiple, exponent, words in SCALED:
         name = name or picture_setting(settings["ingest"])
         own = setting_of(settings, name)
+        if name == "train.effort" and settings["train"].iterations:
+            continue  # it is without effect then
         for factor in factors:
-            value = multiple * round(own * factor / multiple)
+            value = round(multiple * round(own * factor / multiple), 2)
             if value:
                 overrides = ((name, str(value)),)
                 yield Level(parameter, words.format(own), words.format(value), overrides, factor**exponent)
@@ -112,8 +114,32 @@ def picture_setting(ingest: Any) -> str:
     return "ingest.mannequin_size" if ingest.mannequin else "ingest.long_side"
 
 
+def _kinds(settings: Settings) -> Iterator[Level]:
+    """The other representation, and the other precision where heads have one."""
+    train = settings["train"]
+    if is_triplane(settings):
+        words = ("float32", "bfloat16")
+        overrides = (("train.half_precision", str(not train.half_precision).lower()),)
+        yield Level(PRECISION, words[train.half_precision], words[not train.half_precision], overrides, 1.5)
+        yield Level(REPRESENTATION, "triplane", "bases", (("train.representation", "bases"),), 0.2)
+    else:
+        yield Level(REPRESENTATION, "bases", "triplane", (("train.representation", "triplane"),), 5.0)
+
+
+def is_triplane(settings: Settings) -> bool:
+    """True where the avatar is a triplane."""
+    return settings["train"].representation == "triplane"
+
+
 def _gaussians(settings: Settings) -> Iterator[Level]:
-    """Levels of subdivision whatever the pixels; the base's own is what the plan leaves of it."""
+    """The density of the Gaussians: of bases the longest edge, of a triplane levels of subdivision."""
+    if not is_triplane(settings):
+        own = settings["plan"].edge_pixels
+        for factor in EDGES:
+            text = f"{round(own * factor, 1):g}"
+            overrides = (("plan.edge_pixels", text),)
+            yield Level(GAUSSIANS, mesh_of(settings), f"edges of {text} px", overrides, factor**-1.0)
+        return
     mesh = mesh_of(settings)
     own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
     for count, label in enumerate(SUBDIVISIONS):
@@ -124,6 +150,8 @@ def _gaussians(settings: Settings) -> Iterator[Level]:
 
 def mesh_of(settings: Settings) -> str:
     """The fineness of a run's mesh in words."""
+    if not is_triplane(settings):
+        return f"edges of {settings['plan'].edge_pixels:g} px"
     plan = settings["plan"].subdivision
     own = 0 if plan == "off" else settings["train"].subdivisions
     return f"at most {SUBDIVISIONS[own]}" if own and plan == "auto" else SUBDIVISIONS[own]
@@ -134,7 +162,7 @@ def _switched(settings: Settings) -> Iterator[Level]:
     train = settings["train"]
     idle = {  # parts that other settings of the base leave nothing to do
         "pose heads": train.pose_heads_from >= 1,
-        "residual colours": not train.residual_parts,
+        "residual colours": not train.residual_parts or not is_triplane(settings),
         "visibility gate": not train.gate,
         "pose refinement": not train.refine_poses,
     }

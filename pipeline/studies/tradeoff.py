@@ -21,16 +21,18 @@ from pipeline.studies.search import Run, Search, point_table, seconds_of, spoken
 from pipeline.studies.sweep import (
     GAUSSIANS,
     PRECISION,
+    REPRESENTATION,
     Level,
     combinations,
     frontier,
     noise_of,
     overrides_of,
+    setting_of,
     sweep_levels,
     worth_of,
 )
 from pipeline.studies.tables import MAIN, NOTE, Table
-from pipeline.studies.variants import Base, Result, Variant, base_of, run_record
+from pipeline.studies.variants import Base, Result, Settings, Variant, base_of, run_record
 
 DEFAULT_BUDGET = "20m"
 COLUMNS = [
@@ -151,19 +153,25 @@ def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Resu
 def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
     """Processor seconds that training under a job's settings would cost, from the levels tried alone.
 
-    Iterations count in proportion, levels of subdivision and precision by what they were found to cost.
+    Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
     """
     own, wanted, result = search.base.settings["train"], job.settings["train"], search.results[()]
     cost = result.training_cost
-    marks = run_record(result.folders["train"])["timings"].get("curve_seconds") or [(0, 0.0, cost)]
-    iterating = float(marks[-1][2])  # the rest is spent before and after the iterations
-    cost += iterating * (wanted.iterations / own.iterations - 1)
-    fields = {GAUSSIANS: "subdivisions", PRECISION: "half_precision"}
+    marks = run_record(result.folders["train"])["timings"].get("curve_seconds") or [(1, 0.0, cost)]
+    done, iterating = float(marks[-1][0]), float(marks[-1][2])  # the rest is spent before and after the steps
+    planned = done / own.effort if not own.iterations else done
+    cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
     for level in levels:
-        field = fields.get(level.parameter, "")
-        if field and dict(level.overrides)[f"train.{field}"] == str(getattr(wanted, field)).lower():
-            cost *= search.cost_ratio(level) if getattr(wanted, field) != getattr(own, field) else 1.0
+        if level.parameter not in (GAUSSIANS, PRECISION, REPRESENTATION):
+            continue
+        if all(_text(job.settings, name) == text for name, text in level.overrides):
+            cost *= search.cost_ratio(level)
     return cost
+
+
+def _text(settings: Settings, name: str) -> str:
+    """The value of a setting as a command line has it."""
+    return str(setting_of(settings, name)).lower()
 
 
 def numbered(points: pd.DataFrame) -> pd.DataFrame:

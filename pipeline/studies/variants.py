@@ -29,7 +29,7 @@ Settings = Mapping[str, Any]
 
 SCALES: Mapping[str, Overrides] = {
     "preset": {},
-    "small": {"train.iterations": "200", "train.subdivisions": "0"},
+    "small": {"train.iterations": "200", "train.subdivisions": "0", "plan.edge_pixels": "5"},
 }
 """``scale=`` -> its overrides; those of the command line win over them."""
 
@@ -170,7 +170,8 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
     if hasattr(train, "held_out_every"):
-        lean["train.held_out_every"] = str(min(train.held_out_every, max(1, train.iterations // 10)))
+        tenth = max(1, train.iterations // 10) if train.iterations else train.held_out_every
+        lean["train.held_out_every"] = str(min(train.held_out_every, tenth))
     changed = any(not name.startswith("evaluate.") for name in own)
     full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
     return Base(subject, full, log, "" if changed else request.preset)
