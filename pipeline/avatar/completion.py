@@ -51,7 +51,7 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
     """
     decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
-    trust = torch.stack([evidence.trust, evidence.shape_trust], 1)
+    trust = evidence.together
     avatar.trust.index_copy_(0, rows, trust.to(avatar.trust))
     if bool((trust == 1).all()):
         return

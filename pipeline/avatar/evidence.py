@@ -64,6 +64,11 @@ class Evidence:
         """How far its place and size are, [N] in [0, 1]: also what a silhouette showed from its edge."""
         return ramp(self.frames, DOUBTED, TRUSTED)
 
+    @property
+    def together(self) -> Tensor:
+        """Trust of colour and of shape, [N, 2], as ``Avatar.trust`` has it."""
+        return torch.stack([self.trust, self.shape_trust], 1)
+
     def filled(self, other: Evidence) -> Evidence:
         """This evidence, and where it is weak the other's, as of generated frames beside captured ones."""
         share = self.trust[:, None]

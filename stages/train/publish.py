@@ -14,7 +14,7 @@ from pipeline.clip.camera import facing_camera
 from pipeline.clip.curves import Curve
 from pipeline.clip.frames import write_png
 from stages.train.frame_evidence import settle_unseen
-from stages.train.initial_colors import color_unseen
+from stages.train.gated_colors import color_unseen
 from stages.train.loop import Trainer
 from stages.train.visibility_gate import VisibilityGate, write_ungated
 

@@ -200,6 +200,10 @@ class TrainSettings:
     scale_size: Weight = setting(0.0, "size of scales, metres squared")
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
+    scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
+    weak_smoothness: Weight = setting(
+        10.0, "times more that smoothness counts where no frame showed enough, continuously"
+    )
     hand_color: Weight = setting(0.0, "differences of the hands' colours from their mean")
     arm_color: Weight = setting(0.0, "differences of the arms' lower sides from their upper sides")
     residual_size: Weight = setting(1e-3, "size of residual colours, in logits")

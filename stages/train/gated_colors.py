@@ -1,4 +1,4 @@
-"""Colours at the start of training, from what the frames really showed, and of what the gate took."""
+"""Colours of what the visibility gate took."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar
-from pipeline.avatar.completion import BRIGHTEST, DARKEST, complete_color_logits
+from pipeline.avatar.completion import BRIGHTEST, DARKEST
 from pipeline.avatar.sparse import SparsePair
-from stages.train.data import TrainingData
-from stages.train.frame_evidence import evidence_of
-from stages.train.poses import PoseRefinement
 
 FILL_ROUNDS = 16  # rings over which gated vertices take their neighbours' colour
 
@@ -27,28 +24,6 @@ def color_unseen(avatar: Avatar) -> None:
         known[surface.rows] = 1
         filled = torch.logit(fill_from_neighbours(color, known, full.neighbours).clamp(DARKEST, BRIGHTEST))
         avatar.base_color.copy_(torch.where(known > 0, avatar.base_color, filled))
-
-
-def initial_color_logits(
-    avatar: Avatar,
-    poses: PoseRefinement,
-    data: TrainingData,
-    chosen: tuple[int, ...],
-    made: tuple[int, ...] = (),
-) -> Tensor:
-    """Logits of the mean colour that the chosen frames show of each Gaussian, [N, 3], completed.
-
-    Only what a frame really shows counts, not what shines through from behind, see
-    ``pipeline/avatar/evidence.py``.
-
-    Args:
-        avatar: untrained.
-        poses: of every frame.
-        data: the frames.
-        chosen: frame numbers.
-        made: generated frames; they are asked for what no chosen frame shows.
-    """
-    return complete_color_logits(avatar.surface(), evidence_of(avatar, poses, data, chosen, made))
 
 
 def fill_from_neighbours(total: Tensor, weight: Tensor, neighbours: SparsePair) -> Tensor:
