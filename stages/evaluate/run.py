@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
 from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
+from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
@@ -66,6 +68,7 @@ from stages.evaluate.test_pose_refinement import (
     write_refined,
 )
 from stages.evaluate.textured_mesh import TexturedMesh, textured_mesh
+from stages.evaluate.turned import SeenSurface, Turned, look_around, seen_surface
 from stages.evaluate.upstream import (
     GateRecord,
     StageRecord,
@@ -108,6 +111,7 @@ def run(context: Context) -> None:
         if settings.identity
         else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
+        surface=seen_surface(avatar),
         start=start,
     )
 
@@ -150,6 +154,7 @@ def evaluate(
     second: SecondMask | None = None,
     embedder: FaceEmbedder | None = None,
     other_cameras: Sequence[TableRow] = (),
+    surface: SeenSurface | None = None,
     start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
@@ -164,6 +169,7 @@ def evaluate(
         second: the second masks, where the ceiling is measured.
         embedder: of faces, where they are compared.
         other_cameras: scores in cameras that are not the clip's.
+        surface: of the Gaussians, if they are to be looked at from all sides.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
@@ -183,13 +189,27 @@ def evaluate(
     cover = write_pictures(context, avatar, relaxed, comparisons)
     summary = summarise(context, clip, table, scorer, nearest.nearest, refined, gate, second)
     summary["gaussians"] = len(relaxed)
+    turned = turn(context, relaxed, surface)
+    summary["turned"] = None if turned is None else turned.numbers
     summary["verdict"] = verdict(summary, clip_coverage(context, plan, gate))
     write_json(context.output / "summary.json", summary)
     contents = report_contents(
         context, clip, summary, table, comparisons, cover, (plan, refined, gate), time.monotonic() - start
     )
+    contents = dataclasses.replace(contents, turned=turned)
     write_report(context.output / "report.html", contents)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def turn(context: Context, relaxed: Gaussians, surface: SeenSurface | None) -> Turned | None:
+    """The avatar from all sides; the back of the head is searched for a face where MediaPipe is at hand."""
+    if surface is None:
+        return None
+    start, asset = time.monotonic(), context.assets.get("mediapipe")
+    finder = None if asset is None else FaceFinder(asset, context.work / "mediapipe.log")
+    turned = look_around(relaxed, surface, finder)
+    context.timing("turned_seconds", time.monotonic() - start)
+    return turned
 
 
 def score(
