@@ -2,8 +2,8 @@
 
 - **holes**: the share of the posed body's silhouette, two pixels smaller, where the avatar's alpha is under
   0.95;
-- **speckle**: how much colours differ from their neighbours' on guessed surface, over the same on surface that
-  frames showed; above 1 the guess is noisier than what was seen;
+- **speckle**: how much colours differ from their neighbours' on guessed surface, over the same on surface
+  that frames showed; above 1 the guess is noisier than what was seen;
 - **a face behind**: a face is found where the back of the head is.
 """
 

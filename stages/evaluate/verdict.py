@@ -26,7 +26,7 @@ CLEAR = 1.0  # dB under which a cause is not worth naming
 NEAR_CEILING = 2.0  # dB between avatar and ceiling, under which masks are what is measured
 PARTS = 3.0  # dB by which a part must be worse than the whole person to be named
 NAMED = 2  # causes
-HOLES = 0.005  # share of the silhouette, from which holes are named
+HOLES = 0.5  # percent of the silhouette, from which holes are named
 SPECKLE = 1.2  # of guessed over seen surface, from which it is named
 
 _OVER = {NEAREST: "copying the nearest training frame", MESH: "the textured mesh"}
@@ -154,14 +154,11 @@ def worst_side(numbers: Mapping[str, Any] | None) -> str:
         return ""
     if numbers["face_behind"]:
         return "Turned round, a face is found where the back of the head is."
-    if numbers["holes"] >= HOLES:
-        return (
-            f"Turned round, it has holes: {100 * numbers['holes']:.1f}% of its silhouette lets light through."
-        )
-    if numbers["speckle"] is not None and numbers["speckle"] >= SPECKLE:
-        return (
-            f"Turned round, what no frame showed is {numbers['speckle']:.1f} times as speckled as the rest."
-        )
+    holes, speckle = 100 * numbers["holes"], numbers["speckle"]
+    if holes >= HOLES:
+        return f"Turned round, it has holes: {holes:.1f}% of its silhouette lets light through."
+    if speckle is not None and speckle >= SPECKLE:
+        return f"Turned round, what no frame showed is {speckle:.1f} times as speckled as the rest."
     return ""
 
 
