@@ -31,5 +31,8 @@ RenderMask = Literal["own", "truth"]
 Refinement = Literal["plan", "on", "off"]
 """Whether held-out poses are refined on the held-out images: as the plan says, always, never."""
 
+EdgeColors = Literal["own", "photograph"]
+"""The truth's colours where its mask is soft: the person's own, or the photograph's, the wall among them."""
+
 ProtocolName = Literal["ours", "paper", "paper_black"]
-"""Named sets of the three choices before; see ``pipeline.config.evaluation_protocol``."""
+"""Named sets of the four choices before; see ``pipeline.config.evaluation_protocol``."""

@@ -32,6 +32,8 @@ from pipeline.texture import (
     robust_mean,
     weighted_median,
 )
+from pipeline.texture.completion import shading
+from pipeline.texture.membrane import neighbours, screened_membrane
 from stages.auxiliary import run as stage
 from stages.auxiliary.crop import find_framing
 from stages.auxiliary.folder import read_folder
@@ -39,7 +41,7 @@ from stages.auxiliary.publish import NOTHING_NEW
 from stages.auxiliary.reference import score_frames
 from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turntable_keypoints
-from stages.auxiliary.texture_generator import complete, membrane, neighbours, shading
+from stages.auxiliary.texture_generator import complete
 from stages.auxiliary.turntable_motion import ID_OFFSET, make_turntable_motion
 from tests.made.body import BODY_FILE, open_body, open_landmarks
 from tests.made.mannequin_clip import context_for, read, write_clip
@@ -141,22 +143,23 @@ def test_a_frame_that_slipped_is_outvoted():
     assert robust_mean(colors, np.ones((5, 1), np.float32)) == pytest.approx(100)
 
 
-def test_the_membrane_is_straight_between_its_ends():
+def test_a_membrane_without_a_screen_is_straight_between_its_ends():
     count = 11
     chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
-    values, fixed = np.zeros((count, 1)), np.zeros(count, bool)
-    values[-1], fixed[[0, -1]] = 10, True
-    found = membrane(neighbours(chain, count), values, fixed, np.zeros(1))
-    assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-3)
-    again = membrane(neighbours(chain, count), values, fixed, np.zeros(1), start=found)
-    assert again == pytest.approx(found, abs=0.05)
+    values, hold = np.zeros((count, 1)), np.zeros(count)
+    values[-1], hold[[0, -1]] = 10, 1e6
+    found = screened_membrane(neighbours(chain, count), values, hold, np.full(count, 1e-9))
+    assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-2)
 
 
-def test_a_part_without_a_known_neighbour_takes_the_mean():
-    pairs = np.array([[0, 1], [2, 3]])
-    fixed = np.array([True, False, False, False])
-    found = membrane(neighbours(pairs, 4), np.full((4, 1), 7.0), fixed, np.array([3.0]))
-    assert found[:, 0] == pytest.approx([7, 7, 3, 3], abs=1e-3)
+def test_a_screen_lets_a_membrane_fade_away_from_what_is_held():
+    count = 41
+    chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
+    hold = np.where(np.arange(count) == 0, 1e6, 0.0)
+    sink = np.full(count, 0.04)  # a reach of five edges
+    found = screened_membrane(neighbours(chain, count), np.full((count, 1), 3.0), hold, sink)[:, 0]
+    assert found[0] == pytest.approx(3, abs=1e-2) and found[-1] < 0.02 and (np.diff(found) < 1e-6).all()
+    assert found[5] == pytest.approx(3 / np.e, rel=0.05)
 
 
 def test_the_unseen_side_is_the_mirror_of_the_seen_one():
@@ -181,13 +184,13 @@ def test_an_unseen_back_is_shaded_as_the_light_says():
     known = normal[:, 2] > 0.1
     color = (150 * np.exp(0.4 * normal[:, 2:3]) * np.ones((1, 3))).astype(np.float32)
     weight = known.astype(np.float32)
-    shade = shading(color, weight, normal, surface.part)
+    shade = shading(color / 255, weight, normal, surface.segments.part)
     assert shade[known].max() - shade[known].min() == pytest.approx(0.34, abs=0.04)
     back = normal[:, 2] < -0.5
     assert shade[back] == pytest.approx(shade[known].min(), abs=0.02)
     seen = VertexColors(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
     assert np.median(complete(surface, seen)[back]) < 165
-    assert not shading(color, np.zeros(len(color)), normal, surface.part).any()
+    assert not shading(color, np.zeros(len(color)), normal, surface.segments.part).any()
 
 
 def test_projected_colours_are_those_of_the_frames(full):

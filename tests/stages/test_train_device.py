@@ -5,15 +5,15 @@ import importlib
 import pytest
 import torch
 
+from pipeline.avatar import evidence, load_avatar
 from pipeline.avatar import head as heads
-from pipeline.avatar import load_avatar
 from pipeline.avatar import skinning_tables as posing
 from pipeline.body import Pose
 from pipeline.clip import curves
 from pipeline.device import moved
 from pipeline.files.tables import read_table
 from pipeline.splat import render
-from stages.train import held_out, initial_colors, objective
+from stages.train import held_out, objective
 from stages.train import run as stage
 from tests.made.body import open_body
 from tests.made.portrait import context_for, data_for, run_counted
@@ -26,7 +26,7 @@ ALL_ON = {
     "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, held_out, initial_colors)
+RENDERERS = (objective, held_out, evidence)
 
 
 def without_kernels(monkeypatch):
