@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import stat
 import warnings
 import zipfile
 from pathlib import Path, PurePosixPath
@@ -51,7 +52,10 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         UserError: the file is missing, cannot be read, or is too large.
     """
     try:
-        size = path.stat().st_size
+        status = path.stat()
+        size = status.st_size
+        if not stat.S_ISREG(status.st_mode):  # reading a FIFO would wait for somebody who writes
+            raise UserError(f"{path} is no file that can be read as a whole: {remedy}")
         if size > most:
             raise UserError(f"{path} has {size >> 20} MB, more than the {most >> 20} MB allowed: {remedy}")
         with path.open("rb") as file:
