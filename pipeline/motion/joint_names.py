@@ -48,10 +48,30 @@ _FINGER_WORDS = {
 }  # fmt: skip
 _BIPED_FINGERS = ("thumb", "index", "middle", "ring", "pinky")  # Finger0, Finger01, Finger02; Finger1, ...
 _PELVIS = ("hips", "pelvis", "hip", "root")
-_NECK = ("neck", "neck1", "necklower", "lowerneck", "necktwist1", "spine004", "neckbase", "upperneck", "neck2")
+_NECK = (
+    "neck",
+    "neck1",
+    "necklower",
+    "lowerneck",
+    "necktwist1",
+    "spine004",
+    "neckbase",
+    "upperneck",
+    "neck2",
+)
 _HEAD = ("head", "spine006", "skull")
 _SPINE = {  # joint -> words, the most usual first
-    "spine1": ("spine", "abdomen", "lowerback", "waist", "torso", "spine1", "lowerspine", "abdomenlower", "l5"),
+    "spine1": (
+        "spine",
+        "abdomen",
+        "lowerback",
+        "waist",
+        "torso",
+        "spine1",
+        "lowerspine",
+        "abdomenlower",
+        "l5",
+    ),
     "spine2": ("spine1", "chest", "spine2", "upperback", "abdomenupper", "midspine", "l3"),
     "spine3": ("spine2", "chest2", "spine3", "upperchest", "thorax", "chestupper", "upperspine", "t8"),
 }
@@ -178,7 +198,11 @@ def _spine(
         pelvis: the pelvis and what is above it.
     """
     arms = [limbs[name] for name in ("left_collar", "right_collar") if name in limbs]
-    arms = arms if len(arms) > 1 else [limbs[f"{side}_shoulder"] for side in _SIDES if f"{side}_shoulder" in limbs]
+    arms = (
+        arms
+        if len(arms) > 1
+        else [limbs[f"{side}_shoulder"] for side in _SIDES if f"{side}_shoulder" in limbs]
+    )
     known = {place for part in (*_SPINE, "spine") for _, place in places["", part]} - taken - {*pelvis}
     line = [place for place in reversed(tree.shared(arms)) if place in known] or sorted(known)
     if len(line) > len(_SPINE):
@@ -186,7 +210,9 @@ def _spine(
     ranks = {part: {place: rank for rank, place in reversed(sorted(places["", part]))} for part in _SPINE}
     best = min(
         itertools.combinations(_SPINE, len(line)),
-        key=lambda parts: sum(ranks[part].get(place, _UNUSUAL) for part, place in zip(parts, line, strict=True)),
+        key=lambda parts: sum(
+            ranks[part].get(place, _UNUSUAL) for part, place in zip(parts, line, strict=True)
+        ),
     )
     return dict(zip(best, line, strict=True))
 
@@ -272,7 +298,9 @@ def _finger_words(finger: str, k: int) -> tuple[str, ...]:
 def _all_roles() -> dict[str, tuple[_Role, ...]]:
     """Every word that is known -> what it may mean."""
     found: dict[str, list[_Role]] = defaultdict(list)
-    sided = {**_LEG, **_ARM} | {f"{finger}{k}": _finger_words(finger, k) for finger in FINGERS for k in (1, 2, 3)}
+    sided = {**_LEG, **_ARM} | {
+        f"{finger}{k}": _finger_words(finger, k) for finger in FINGERS for k in (1, 2, 3)
+    }
     for part, words in sided.items():
         for rank, word in enumerate(words):
             for side, marks in _SIDES.items():

@@ -115,7 +115,9 @@ def reference_orientations(
         known = end is not None and end in places and name in places
         if standing is not None and name in ("pelvis", "left_ankle", "right_ankle"):
             foot = places[end] - places[name] if known and end is not None else None
-            world.append(standing.frame if foot is None else _foot(standing, rest[_INDEX[end]] - rest[joint], foot))
+            world.append(
+                standing.frame if foot is None else _foot(standing, rest[_INDEX[end]] - rest[joint], foot)
+            )
         elif standing is None and name in ("spine2", "spine3"):
             world.append(trunks["shoulder"])
         elif name.endswith("wrist"):

@@ -74,7 +74,9 @@ def retarget(
     Raises:
         UserError: the skeleton lacks a joint that is needed and known by name, or its bones have no length.
     """
-    return retarget_rows(bvh, joints, parents, frame_indices(len(bvh.values), bvh.fps, count, fps), origin=origin)
+    return retarget_rows(
+        bvh, joints, parents, frame_indices(len(bvh.values), bvh.fps, count, fps), origin=origin
+    )
 
 
 def retarget_rows(
@@ -106,7 +108,10 @@ def retarget_rows(
     standing = stance(still)
     axis, witness = _up(up, shown, positions[:wanted], standing)
     if standing is not None:
-        start, scale = torch.eye(3, dtype=torch.float64).expand(len(bvh.names), 3, 3), _leg(rest) / _leg_of(still)
+        start, scale = (
+            torch.eye(3, dtype=torch.float64).expand(len(bvh.names), 3, 3),
+            _leg(rest) / _leg_of(still),
+        )
         at_start = reference_orientations(still, rest, parents, standing)
     else:
         frame = straightest(shown)
@@ -150,9 +155,7 @@ def yaw(orientation: Tensor) -> Tensor:
     return roma.rotvec_to_rotmat(torch.stack([angle * 0, angle, angle * 0]))
 
 
-def _up(
-    up: Up, places: Places, everything: Tensor, standing: Stance | None
-) -> tuple[UpAxis, str]:
+def _up(up: Up, places: Places, everything: Tensor, standing: Stance | None) -> tuple[UpAxis, str]:
     """The axis that is up, and what says so."""
     if up != "auto":
         return up, "as it was said"
