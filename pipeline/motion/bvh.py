@@ -143,7 +143,7 @@ class _Skeleton:
         self._open: list[int] = []  # -1 for an end site
 
     def read(self, stream: Iterator[str]) -> None:
-        """Reads the words from HIERARCHY to MOTION; ValueError, IndexError or StopIteration where they are bad."""
+        """Reads the words from HIERARCHY to MOTION; an error of Python's where they are bad."""
         _expect(stream, "HIERARCHY")
         for word in stream:
             kind = word.upper()

@@ -6,8 +6,8 @@ Before they are looked up, a namespace (``mixamorig:``, ``Armature|``), spaces, 
 the prefix that most names share are taken off.
 
 One word means different joints in different programs (SMPL's ``left_foot`` is Mixamo's ``LeftToeBase``; a
-``LeftShoulder`` may be the collar), so each limb's names are read together: along the skeleton, as many joints
-as can be are given to the schema's in order, and among equals the usual meaning counts.
+``LeftShoulder`` may be the collar), so each limb's names are read together: along the skeleton, as many
+joints as can be are given to the schema's in order, and among equals the usual meaning counts.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from pipeline.errors import UserError
 
 _SIDES = {"left": ("left", "l"), "right": ("right", "r")}
 _LEG = {  # joint -> words, the most usual first
-    "hip": ("upleg", "thigh", "hip", "upperleg", "femur", "thighbend", "upperleg1", "uleg", "leg", "hipjoint"),
+    "hip": (
+        "upleg", "thigh", "hip", "upperleg", "femur", "thighbend", "upperleg1", "uleg", "leg", "hipjoint",
+    ),
     "knee": ("leg", "knee", "shin", "calf", "lowleg", "lowerleg", "tibia", "lowerleg1", "lleg"),
     "ankle": ("ankle", "foot"),
     "foot": (

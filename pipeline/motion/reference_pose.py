@@ -1,10 +1,10 @@
 """The body's orientation at one pose of a captured skeleton, from which on each joint turns as captured.
 
-Where the skeleton stands upright with straight limbs when all angles are zero, that is the pose: the trunk is
-upright there by construction, whatever the places of its joints, and so are feet and head. Else it is the frame
-of the capture with the straightest limbs, and the trunk is found from hips, shoulders and neck.
+Where the skeleton stands upright with straight limbs when all angles are zero, that is the pose: the trunk
+is upright there by construction, whatever the places of its joints, and so are feet and head. Else it is the
+frame of the capture with the straightest limbs, and the trunk is found from hips, shoulders and neck.
 
-Limbs and fingers are laid along the captured bones by the shortest turn, hands along the roots of the fingers.
+Limbs and fingers are laid along the captured bones by the shortest turn, hands along the fingers' roots.
 """
 
 from __future__ import annotations
@@ -111,23 +111,27 @@ def reference_orientations(
     world: list[Tensor] = []
     for joint, name in enumerate(JOINT_NAMES):
         above = world[parents[joint]] if joint else trunks["hip"]
-        end = _BONES.get(name)
-        known = end is not None and end in places and name in places
+        bone = _bone(name, places, rest)
         if standing is not None and name in ("pelvis", "left_ankle", "right_ankle"):
-            foot = places[end] - places[name] if known and end is not None else None
-            world.append(
-                standing.frame if foot is None else _foot(standing, rest[_INDEX[end]] - rest[joint], foot)
-            )
+            world.append(standing.frame if bone is None else _foot(standing, *bone))
         elif standing is None and name in ("spine2", "spine3"):
             world.append(trunks["shoulder"])
         elif name.endswith("wrist"):
             world.append(_palm(name, places, rest, above))
-        elif known and end is not None:
-            there = places[end] - places[name]
-            world.append(_shortest_turn(above @ (rest[_INDEX[end]] - rest[joint]), there) @ above)
+        elif bone is not None:
+            here, there = bone
+            world.append(_shortest_turn(above @ here, there) @ above)
         else:
             world.append(above)
     return world
+
+
+def _bone(name: str, places: Places, rest: Tensor) -> tuple[Tensor, Tensor] | None:
+    """A joint's bone at rest and as captured, [3] each; None where an end is missing or it has none."""
+    end = _BONES.get(name)
+    if end is None or end not in places or name not in places:
+        return None
+    return rest[_INDEX[end]] - rest[_INDEX[name]], places[end] - places[name]
 
 
 def _named(rest: Tensor) -> dict[str, Tensor]:

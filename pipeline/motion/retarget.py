@@ -93,8 +93,8 @@ def retarget_rows(
     Args:
         bvh, joints, parents, origin: as for ``retarget``.
         rows: the frames that are wanted.
-        reference: the frames that show how the body stands, and, where zero angles do not, among which the one
-            with the straightest limbs is sought; ``rows`` if None.
+        reference: the frames that show how the body stands, and, where zero angles do not, among which the
+            one with the straightest limbs is sought; ``rows`` if None.
         up: the axis that is up in the capture; auto: found.
     """
     columns = match_joints(bvh.names, bvh.parents, origin)

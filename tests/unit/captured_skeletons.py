@@ -24,8 +24,8 @@ def _skeleton(side, trunk, arm, leg, fingers=None):
 
     Args:
         side: (side, word) -> a sided joint's name.
-        trunk, arm, leg: names along the chain, in order; "-" for a joint that it lacks, ``~name`` for one that
-            it has besides.
+        trunk, arm, leg: names along the chain, in order; "-" for a joint that it lacks, ``~name`` for one
+            that it has besides.
         fingers: finger joint -> word.
     """
     names = {}
@@ -115,7 +115,8 @@ SKELETONS = {
         "~Buttock Thigh Shin Foot Toe", lambda joint: joint.title().replace("Middle", "Mid"),
     ),
     "daz": _skeleton(
-        _letter("{side}{word}"), "hip abdomenLower abdomenUpper ~chestLower chestUpper neckLower ~neckUpper head",
+        _letter("{side}{word}"),
+        "hip abdomenLower abdomenUpper ~chestLower chestUpper neckLower ~neckUpper head",
         "Collar ShldrBend ~ShldrTwist ForearmBend ~ForearmTwist Hand",
         "ThighBend ~ThighTwist Shin Foot ~Metatarsals Toe",
     ),
@@ -128,7 +129,8 @@ SKELETONS = {
         "Clavicle UpperArm Forearm Hand", "Thigh Calf Foot Toe0", _biped_finger,
     ),
     "unreal": _skeleton(
-        _letter("{word}_{side}"), "pelvis spine_01 ~spine_02 spine_03 ~spine_04 spine_05 neck_01 ~neck_02 head",
+        _letter("{word}_{side}"),
+        "pelvis spine_01 ~spine_02 spine_03 ~spine_04 spine_05 neck_01 ~neck_02 head",
         "clavicle upperarm ~upperarm_twist_01 lowerarm hand", "thigh calf foot ball",
         lambda joint: f"{joint[:-1]}_0{joint[-1]}",
     ),
@@ -141,7 +143,8 @@ SKELETONS = {
         "UpperLeg LowerLeg Foot Toes",
     ),
     "rigify": _skeleton(
-        _letter("DEF-{word}.{Side}"), _named("DEF-", "spine spine.001 spine.002 spine.003 spine.004 ~spine.005 spine.006"),
+        _letter("DEF-{word}.{Side}"),
+        _named("DEF-", "spine spine.001 spine.002 spine.003 spine.004 ~spine.005 spine.006"),
         "shoulder upper_arm forearm hand", "thigh shin foot toe",
         lambda joint: ("" if "thumb" in joint else "f_") + f"{joint[:-1]}.0{joint[-1]}",
     ),
@@ -174,7 +177,8 @@ SKELETONS = {
         "hip knee ankle foot", str,
     ),
     "smpl, letters": _skeleton(
-        _letter("{Side}_{word}"), "Pelvis Spine1 Spine2 Spine3 Neck Head", "Collar Shoulder Elbow Wrist ~Hand",
+        _letter("{Side}_{word}"), "Pelvis Spine1 Spine2 Spine3 Neck Head",
+        "Collar Shoulder Elbow Wrist ~Hand",
         "Hip Knee Ankle Foot",
     ),
     "smpl, maya": _skeleton(
@@ -182,7 +186,8 @@ SKELETONS = {
         "Collar Shoulder Elbow Wrist ~Hand", "Hip Knee Ankle Foot",
     ),
     "mujoco": _skeleton(
-        _letter("{Side}_{word}"), "Pelvis Torso Spine Chest Neck Head", "Thorax Shoulder Elbow Wrist ~Hand",
+        _letter("{Side}_{word}"), "Pelvis Torso Spine Chest Neck Head",
+        "Thorax Shoulder Elbow Wrist ~Hand",
         "Hip Knee Ankle Toe",
     ),
     "arkit": _skeleton(
@@ -204,7 +209,8 @@ SKELETONS = {
         lambda joint: joint.title().replace("Middle", "Mid"),
     ),
     "jnt": _skeleton(
-        _letter("{Side}_{word}_JNT"), _named("C_", "Hips_JNT Spine_JNT Chest_JNT UpperChest_JNT Neck_JNT Head_JNT"),
+        _letter("{Side}_{word}_JNT"),
+        _named("C_", "Hips_JNT Spine_JNT Chest_JNT UpperChest_JNT Neck_JNT Head_JNT"),
         "Clavicle UpperArm Forearm Hand", "Thigh Shin Foot Toe",
     ),
     "names with spaces": _skeleton(
@@ -250,8 +256,8 @@ def write_captured(
         unit: of length, a metre.
         frames: joint -> [3, 3], the joint's own axes at zero rotation, by a function of the joint; the
             identity by default, which leaves the body in T pose where all angles are zero.
-        more: ``ground``: metres that are added to the root's place; ``tilt`` [3, 3]: a turn of the whole world,
-            skeleton left as it is; ``encoding``; ``rate``: the text of the frame time.
+        more: ``ground``: metres that are added to the root's place; ``tilt`` [3, 3]: a turn of the whole
+            world, skeleton left as it is; ``encoding``; ``rate``: the text of the frame time.
     """
     axes = torch.eye(3, dtype=torch.float64) if axes is None else axes
     tilt = more.get("tilt", torch.eye(3, dtype=torch.float64))

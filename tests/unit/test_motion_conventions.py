@@ -93,7 +93,7 @@ def with_bent_limbs(rotation):
 def test_a_capture_in_any_convention_tells_the_same_motion(
     tmp_path_factory, person, name, up, heading, order, unit, own_axes, seed
 ):
-    """With axes of the joints' own, zero angles are no stance: the first frame, a T pose, is the reference."""
+    """With axes of the joints' own, zero angles are no stance: the first frame, a T pose, is."""
     skeleton = SKELETONS[name]
     rotation, way = made_up(4, seed)
     rotation = with_bent_limbs(rotation) if own_axes else rotation
@@ -102,8 +102,8 @@ def test_a_capture_in_any_convention_tells_the_same_motion(
         torch.tensor([0.0, heading if own_axes else 0.0, 0.0], dtype=torch.float64)
     )
     path = write_captured(
-        tmp_path_factory.mktemp("bvh") / "a.bvh", rotation, way, person, skeleton, turn_to_y(up).mT @ facing, order,
-        unit, random_frames(seed) if own_axes else None, ground=HEIGHT,
+        tmp_path_factory.mktemp("bvh") / "a.bvh", rotation, way, person, skeleton, turn_to_y(up).mT @ facing,
+        order, unit, random_frames(seed) if own_axes else None, ground=HEIGHT,
     )  # fmt: skip
     motion = read(path, person)
     limbs = [joint for joint in range(25) if JOINT_NAMES[joint] in skeleton]
@@ -141,8 +141,8 @@ def write_archive(path, rotation, way, up, layout, form, wide, extra, rate="moca
         body = [*range(1, 24)] if layout == "smpl parts" else [*range(1, 22)]
         parts = {"global_orient": [0], "body_pose": body}
         if layout == "smplx parts":
-            parts |= {"jaw_pose": [22], "leye_pose": [23], "reye_pose": [24], "left_hand_pose": [*range(25, 40)],
-                      "right_hand_pose": [*range(40, 55)]}  # fmt: skip
+            parts |= {"jaw_pose": [22], "leye_pose": [23], "reye_pose": [24],
+                      "left_hand_pose": [*range(25, 40)], "right_hand_pose": [*range(40, 55)]}  # fmt: skip
         values |= {name: as_written(turned[:, joints], form) for name, joints in parts.items()}
     arrays = {
         name: value.numpy().astype(np.float64 if wide else np.float32) for name, value in values.items()

@@ -4,6 +4,7 @@ import io
 import json
 import random
 import time
+import warnings
 import zipfile
 
 import numpy as np
@@ -23,7 +24,8 @@ BODY_FILE = REPOSITORY / "data" / "body" / "open_body.npz"
 FILES = 400  # of each kind
 MOST_SECONDS = 20.0  # for one file, on a busy machine
 WORDS = (
-    b"nan", b"inf", b"-1e999", b"1e308", b"99999999999999999999", b"-7", b"0", b"{", b"}", b"{}", b"[", b"]", b"null",
+    b"nan", b"inf", b"-1e999", b"1e308", b"99999999999999999999", b"-7", b"0", b"{", b"}", b"[", b"]",
+    b"null", b"{}",
     b"CHANNELS 3 Zrotation Xrotation Zrotation", b"CHANNELS 99999999", b"End Site {", b"OFFSET", b"JOINT x {",
     b"MOTION", b"Frames: 3", b"\xff\xfe", b"\xef\xbb\xbf", b"\x00", b'"root_pose"', b"\xed\xa0\x80",
 )  # fmt: skip
@@ -77,7 +79,7 @@ def odd_array(array, rng):
         case 5:
             return np.array({"poses": array}, object)
         case 6:
-            return array[:0]
+            return array.reshape(-1)[:0]
         case _:
             return np.zeros((rng.randrange(3), rng.randrange(4), rng.randrange(200)))
 
@@ -96,7 +98,8 @@ def odd_archive(path, rng):
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     if rng.random() < 0.2:
-        with zipfile.ZipFile(buffer, "a") as archive:
+        with warnings.catch_warnings(), zipfile.ZipFile(buffer, "a") as archive:
+            warnings.simplefilter("ignore")  # a name twice
             archive.writestr(rng.choice(["../poses.npy", "poses.npy", "betas.npy"]), rng.randbytes(90))
     path.write_bytes(buffer.getvalue())
 
@@ -138,14 +141,16 @@ def test_a_damaged_motion_is_read_or_refused_in_a_line(tmp_path, person, kind, c
     rotation, way = made_up(3)
     pivot = rest_joints(person.body, person.identity)[0].double()
     names = sorted(SKELETONS)
-    outcomes = {"read": 0, "refused": 0}
+    good, outcomes = {}, {"read": 0, "refused": 0}
     for seed in range(FILES):
         rng = random.Random(f"{kind} {seed}")
         print(f"{kind}, seed {seed}")  # pytest shows it where a file fails
         path = tmp_path / str(seed)
         if kind == "bvh":
-            write_captured(path, rotation, way, person, SKELETONS[names[seed % len(names)]])
-            path.write_bytes(mutated(path.read_bytes(), rng))
+            name = names[seed % len(names)]
+            if name not in good:
+                good[name] = write_captured(path, rotation, way, person, SKELETONS[name]).read_bytes()
+            path.write_bytes(mutated(good[name], rng))
         elif kind == "amass":
             path = write_npz(path.with_suffix(".npz"), rotation, way, pivot, rng.choice(["poses", "parts"]))
             odd_archive(path, rng)

@@ -13,10 +13,10 @@ or, instead of it         ``root_orient`` and ``pose_body``, and, if they are th
 
 What else an archive holds (``gender``, markers, labels) is not looked at. Nothing is unpickled.
 
-AMASS's world is Z up; others are Y up, or -Y where a camera's axes were kept. Whoever stands upright there has
-a root that turns the model's Y axis to the axis that is up, and that is how it is told: by where the root's Y
-axis points on average. The world is turned to Y up, a Z-up one by -90 degrees about X: (x, y, z) becomes
-(x, z, -y). Hands are rotations from flat hands, as AMASS has them.
+AMASS's world is Z up; others are Y up, or -Y where a camera's axes were kept. Whoever stands upright there
+has a root that turns the model's Y axis to the axis that is up, and that is how it is told: by where the
+root's Y axis points on average. The world is turned to Y up, a Z-up one by -90 degrees about X: (x, y, z)
+becomes (x, z, -y). Hands are rotations from flat hands, as AMASS has them.
 """
 
 from __future__ import annotations

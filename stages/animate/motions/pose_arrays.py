@@ -1,9 +1,9 @@
 """SMPL's, SMPL-H's and SMPL-X's poses as archives of arrays hold them: names, shapes, and whose joints.
 
-``poses`` holds everything, J joints in the model's order: 22 (root and body), 24 (SMPL; its two hands are left
-out), 52 (SMPL-H: 30 of the hands after the body), 55 (SMPL-X: jaw and two eyes before the hands). Or root,
-body, and what else there is have arrays of their own. Any of them is [T, 3 J] or [T, J, 3], rotation vectors in
-radians, or [T, J, 3, 3], rotation matrices.
+``poses`` holds everything, J joints in the model's order: 22 (root and body), 24 (SMPL; its two hands are
+left out), 52 (SMPL-H: 30 of the hands after the body), 55 (SMPL-X: jaw and two eyes before the hands). Or
+root, body, and what else there is have arrays of their own. Any of them is [T, 3 J] or [T, J, 3], rotation
+vectors in radians, or [T, J, 3, 3], rotation matrices.
 """
 
 from __future__ import annotations
