@@ -12,7 +12,7 @@ from pipeline.errors import UserError
 from pipeline.texture import robust_mean, weighted_median
 from stages.auxiliary import run as stage
 from stages.auxiliary.texture_generator import membrane, neighbours, shading
-from tests.stages.auxiliary_subject import FRAMES, context_for, write_clip
+from tests.made.mannequin_clip import FRAMES, context_for, write_clip
 
 SIZE = 48
 

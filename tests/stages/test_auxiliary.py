@@ -1,5 +1,6 @@
 """The auxiliary stage: guidance, the texture, the crop, folders of others, and when nothing is made."""
 
+import dataclasses
 import json
 import shutil
 
@@ -40,8 +41,9 @@ from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turntable_keypoints
 from stages.auxiliary.texture_generator import complete, membrane, neighbours, shading
 from stages.auxiliary.turntable_motion import ID_OFFSET, make_turntable_motion
-from tests.plans import plan_of
-from tests.stages.auxiliary_subject import BODY_FILE, body_and_landmarks, context_for, read, write_clip
+from tests.made.body import BODY_FILE, open_body, open_landmarks
+from tests.made.mannequin_clip import context_for, read, write_clip
+from tests.made.plans import plan_of
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +91,7 @@ def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
 
 
 def test_a_turned_away_face_has_no_points_and_a_hidden_limb_a_lower_score(full):
-    clip, landmarks = read(full), body_and_landmarks()[1]
+    clip, landmarks = read(full), open_landmarks()
     points = turntable_keypoints(clip, make_turntable_motion(clip, small()), landmarks)
     assert points[0, FACE, 2].mean() > 0.9 and points[4, FACE, 2].mean() < 0.1
     assert points[0, 0, 2] == 1 and points[4, 0, 2] == 0
@@ -159,7 +161,7 @@ def test_a_part_without_a_known_neighbour_takes_the_mean():
 
 def test_the_unseen_side_is_the_mirror_of_the_seen_one():
     """Known on the left only, with a pattern: the right gets the pattern, not a blur."""
-    body = body_and_landmarks()[0]
+    body = open_body()
     surface = fine_surface(body, 0)
     points = body.v_template.numpy()
     pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
@@ -174,8 +176,8 @@ def test_the_unseen_side_is_the_mirror_of_the_seen_one():
 
 def test_an_unseen_back_is_shaded_as_the_light_says():
     """White seen from the front under a lamp in front: the slope is found, and the back is not as bright."""
-    surface = fine_surface(body_and_landmarks()[0], 0)
-    normal = vertex_normals(body_and_landmarks()[0].v_template, surface.faces).numpy()
+    surface = fine_surface(open_body(), 0)
+    normal = vertex_normals(open_body().v_template, surface.faces).numpy()
     known = normal[:, 2] > 0.1
     color = (150 * np.exp(0.4 * normal[:, 2:3]) * np.ones((1, 3))).astype(np.float32)
     weight = known.astype(np.float32)
@@ -264,7 +266,7 @@ def test_the_same_bytes_again(full, painted, tmp_path):
 
 def test_off_costs_nothing(full, tmp_path):
     context = context_for(full, tmp_path / "off", generator="off")
-    context.inputs = {}
+    context = dataclasses.replace(context, inputs={})
     stage.run(context)
     assert not list(context.output.iterdir())
 
@@ -276,7 +278,7 @@ def test_auto_goes_by_the_plan(full, tmp_path):
     assert stage.chosen_generator(quick) == "off" and "auxiliary.generator=auto" in quick.logged[-1]
     shutil.copytree(full / "plan", tmp_path / "plan")
     write_plan(tmp_path / "plan" / "plan.json", plan_of(auxiliary_views=False))
-    context.inputs["plan"] = tmp_path / "plan"
+    context = dataclasses.replace(context, inputs={**context.inputs, "plan": tmp_path / "plan"})
     assert stage.chosen_generator(context) == "off"
 
 
