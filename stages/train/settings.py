@@ -89,8 +89,8 @@ class TrainSettings:
     # smile (65 frames) lost 0.1 dB with 16 of them, carphone (108) gained 0.8 over 8 (docs/results.md).
     bases: BasesCount = setting(
         16,
-        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction that "
-        "the clip does not move in",
+        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction "
+        "that the clip does not move in",
     )
     edge_pixels: EdgePixels | None = setting(
         None,
