@@ -47,6 +47,9 @@ class IngestSettings:
     masks: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of grey pictures, white where the person is"
     )
+    numbered_from: Literal["auto", "0", "1"] = setting(
+        "auto", "the first frame's number in the names of given files that are not named as the frames"
+    )
     poses: str = setting("", "file of poses to start from that lies elsewhere than the footage: SHOW's .pkl")
     test_fraction: TestFraction = setting(
         0.1, "the part of the kept frames, at the clip's end, that is held out"
@@ -106,6 +109,11 @@ class IngestSettings:
         if self.mannequin:
             check_motion(self.mannequin_motion)
         return self
+
+    @property
+    def first_number(self) -> int | None:
+        """The first frame's number in the names of given files; None where the names say."""
+        return None if self.numbered_from == "auto" else int(self.numbered_from)
 
     @property
     def uses_estimator(self) -> bool:
