@@ -31,6 +31,7 @@ from pipeline.config.request import Request, parse_request
 from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.doit_reporter import summarising
+from pipeline.run.effect import check_effect, named_tasks
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
@@ -61,6 +62,10 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
             raise UserError("source= names the footage of one subject; run the subjects one by one")
         for subject in request.subjects:
             load_subject(request.workspace, subject, request.source, request.dataset)
+        stages = load_stages(request.workspace.stages)
+        tasks = named_tasks(sys.argv[1:], stages)
+        if tasks is not None:
+            check_effect(request, tasks, chosen, stages)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return request, chosen

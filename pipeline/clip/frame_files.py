@@ -1,14 +1,13 @@
-"""The frame of a clip that a file means: one rule for every folder of frames, masks, keypoints, cameras, poses.
+"""The frame of a clip that a file means: one rule for frames, masks, keypoints, cameras and poses.
 
 1. **Equal names.** Where the clip is pictures, ``masks/frame_10.png`` belongs to ``frames/frame_10.jpg``. So
    does ``00010.jpg.png``, and so do ``frame_10_keypoints.json`` and ``results_frame_10.json`` where all files
    have the same before or after the picture's name.
-2. **Numbers.** Of several runs of digits in a name, the frame's number is the one that tells the folder's files
+2. **Numbers.** Of several runs of digits in a name, the frame's number is the one that tells the files
    apart: ``0000_person1.json`` is 0, ``clip2_000000000010_keypoints.json`` is 10. Where the clip is pictures
    that have numbers in their names, equal numbers belong together (``7.json`` and ``image_0007.png``), if all
-   do. Otherwise numbers are places in the clip, counted from 0 or from 1: from 0 where there is a file 0; from
-   1 where one has the number of all frames, or where 1 is the least (FFmpeg counts so). Any other equally
-   spaced numbers are places in order where there are as many files as frames.
+   do. Otherwise numbers are places in the clip, counted from 0 or from 1: from 0 where there is a file 0;
+   from 1 where one has the number of all frames, or where 1 is the least (FFmpeg counts so).
 3. What is left is a stranger, and the caller refuses it by name.
 
 Nothing here depends on ``ingest.stride`` or ``ingest.max_frames``: numbers are those of the whole source.
@@ -20,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 
 from pipeline.errors import UserError
@@ -52,7 +51,7 @@ class Match:
         frames: file name -> frame number, in the order of the frames.
         strangers: names of no frame, in natural order; names without a number are in neither.
         how: the rule, in words for the log.
-        counted_from: 0 or 1 where numbers are places, else None.
+        counted_from: the first frame's number where numbers are places, else None.
     """
 
     frames: Mapping[str, int]
@@ -82,9 +81,9 @@ def visible_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 def numbers_in(names: Iterable[str]) -> dict[str, int]:
     """The number in each of a folder's file names; names without digits are left out.
 
-    Names are compared with those that differ from them in digits alone. Of the runs of digits the one with the
-    most values counts; of equals the one whose values lie closest together, then the longest, then one that
-    does not follow a letter, then the last.
+    Names are compared with those that differ from them in digits alone. Of the runs of digits the one with
+    the most values counts; of equals the one whose values lie closest together, then the longest, then one
+    that does not follow a letter, then the last.
     """
     alike: dict[str, list[str]] = defaultdict(list)
     for name in names:
@@ -121,6 +120,30 @@ def number_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     return {frame: files[name] for name, frame in frames.items()}
 
 
+def frame_files(
+    folder: Path,
+    suffixes: Sequence[str],
+    clip: ClipFrames | None,
+    counted_from: int | None = None,
+    log: Callable[[str], None] = lambda line: None,
+) -> dict[int, Path]:
+    """Frame number -> file, of a folder whose files may be of other frames too, sorted.
+
+    Args:
+        clip: all frames of the footage, which the names mean; None: their numbers are frame numbers.
+        counted_from: the first frame's number where the user says so.
+        log: told in one line how files were matched, where ``clip`` says to what.
+
+    Raises:
+        UserError: two files of one frame.
+    """
+    if clip is None:
+        return number_files(folder, suffixes)
+    files, match = match_files(folder, suffixes, clip, counted_from)
+    log(f"{folder.name}: {describe_match(match, clip)}")
+    return files
+
+
 def match_files(
     folder: Path, suffixes: Sequence[str], clip: ClipFrames, counted_from: int | None = None
 ) -> tuple[dict[int, Path], Match]:
@@ -139,7 +162,8 @@ def match_names(
         names: of files, with or without folders and suffixes.
         clip: its frames.
         where: the folder or file that has the names, for messages.
-        counted_from: 0 or 1 where the user says so; then numbers are places in the clip, whatever the names.
+        counted_from: the first frame's number where the user says so; then numbers are places in the clip,
+            whatever the names.
 
     Raises:
         UserError: two names of one frame.
@@ -160,9 +184,6 @@ def match_names(
     placed = _by_place(numbers, clip, where, _first_of(numbers.values(), len(clip.numbers)))
     if not placed.strangers:
         return placed
-    in_order = _in_order(numbers, clip, where)
-    if in_order is not None:
-        return in_order
     if any(number in own for number in numbers.values()):
         known = {name: own[number] for name, number in numbers.items() if number in own}
         return _matched(known, [name for name in numbers if name not in known], EQUAL_NUMBERS, where)
@@ -242,17 +263,6 @@ def _by_place(numbers: Mapping[str, int], clip: ClipFrames, where: Path, first: 
         how += f" (no name has 0{'' if first and least == 1 else f' or {length}' if known else ''})"
     strangers = [name for name in numbers if name not in found]
     return dataclasses.replace(_matched(found, strangers, how, where), counted_from=first)
-
-
-def _in_order(numbers: Mapping[str, int], clip: ClipFrames, where: Path) -> Match | None:
-    """A file a frame with equally spaced numbers, in order; None otherwise."""
-    ordered = sorted(numbers, key=lambda name: numbers[name])
-    values = [numbers[name] for name in ordered]
-    steps = {after - before for before, after in zip(values, values[1:], strict=False)}
-    if len(ordered) != len(clip.numbers) or len(steps) != 1 or steps == {0}:
-        return None
-    how = f"in order, one a frame, numbered {values[0]} to {values[-1]}"
-    return _matched(dict(zip(ordered, clip.numbers, strict=True)), (), how, where)
 
 
 def _matched(frames: Mapping[str, int], strangers: Iterable[str], how: str, where: Path) -> Match:

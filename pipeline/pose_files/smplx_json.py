@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.clip.frame_files import ClipFrames, describe_match, match_files, number_files
+from pipeline.clip.frame_files import ClipFrames, frame_files
 from pipeline.errors import UserError
 from pipeline.pose_files.camera_frame import HAND_JOINTS
 from pipeline.pose_files.initial_poses import InitialPoses, on_frames
@@ -50,7 +50,7 @@ def read_smplx_json(
         hand_mean: [30, 3], what the hands are relative to, from ``read_hand_mean``.
         log: told in a line each how files were matched and how many frames had to be interpolated.
         clip: all frames of the source; None: the names' numbers are frame numbers.
-        counted_from: 0 or 1 where the user says what number the first frame has.
+        counted_from: the first frame's number where the user says so.
 
     Raises:
         UserError: no frame has a usable file, or a file is malformed.
@@ -110,11 +110,7 @@ def _by_frame(
 ) -> dict[int, Path]:
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder: {_REMEDY}")
-    if clip is None:
-        return number_files(folder, (".json",))
-    paths, match = match_files(folder, (".json",), clip, counted_from)
-    log(f"{folder.name}: {describe_match(match, clip)}")
-    return paths
+    return frame_files(folder, (".json",), clip, counted_from, log)
 
 
 def _read_frame(path: Path) -> dict[str, np.ndarray] | None:

@@ -33,7 +33,7 @@ class DetectionSources:
         mediapipe: the asset's folder; None where nothing is asked of it.
         keypoints: another program's; None where MediaPipe gives the keypoints.
         masks: frame number -> picture; None where MediaPipe gives the masks.
-        mask_kind: the person is ``white``, ``inverted`` (black) or ``nonzero`` in them, before a look at them.
+        mask_kind: the person is ``white``, ``inverted`` (black) or ``nonzero`` in them, as the dataset says.
         names: for ``footage.json``: what ``keypoints`` and ``masks`` came from.
         mask_form: how the masks are encoded, once they were looked at.
     """
@@ -83,7 +83,7 @@ def _keypoints(
     path = Path(setting)
     if not path.exists():
         raise UserError(
-            f"{path} does not exist: ingest.keypoints must be 'mediapipe', a folder of files or a file"
+            f"{path} is not a folder: ingest.keypoints must be 'mediapipe', a folder of files or a file"
         )
     if span is not None:
         given, _ = open_keypoints(path, ClipFrames(range(span.stop)), 0)
@@ -144,8 +144,8 @@ def _stranger(path: Path, strangers: Sequence[str], frames: ClipFrames, clip: Cl
     place = path / strangers[0] if path.is_dir() else f"{path}, '{strangers[0]}'"
     meant = f"is for frame {numbers[0]}, which the clip does not have" if numbers else "is of no frame"
     return UserError(
-        f"{place} {meant} ({len(strangers)} such; {clip.path.name} has {len(frames.numbers)} frames): name the "
-        "files as the frames, say ingest.numbered_from=0 or 1, or take them out"
+        f"{place} {meant} ({len(strangers)} such; {clip.path.name} has {len(frames.numbers)} frames): "
+        "name the files as the frames, say ingest.numbered_from (the first frame's number), or take them out"
     )
 
 

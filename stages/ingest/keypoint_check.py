@@ -1,4 +1,4 @@
-"""Given keypoints against the person's mask: which person is meant, and whether the points are of this footage."""
+"""Given keypoints on the person's mask: which person is meant, and whether they are of this footage."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def choose_person(people: np.ndarray, mask: np.ndarray, path: Path) -> Agreement
 
 
 def check_agreement(found: list[Agreement]) -> None:
-    """Refuse a clip whose points do not lie on the person; UserError names the first such file and the remedy."""
+    """Refuse a clip whose points do not lie on the person; UserError names the first such file."""
     judged = [one for one in found if np.isfinite(one.share)]
     if not judged or float(np.median([one.share for one in judged])) >= OFF_CLIP:
         return

@@ -6,7 +6,7 @@ Read are, a JSON file a frame:
 - people with ``keypoints`` and ``keypoint_scores``: mmpose's inferencer (a list), its demo's results
   (``instance_info``) and its ``predictions``; points nested one level deeper are taken out;
 - 134 points, DWPose's with a neck, in OpenPose's order or with the neck after COCO's 17;
-- OpenPose's ``people`` with 25 or 18 body points, face and hands; a canvas that it names is scaled to the clip;
+- OpenPose's ``people`` with 25 or 18 body points, face and hands; a canvas that it names becomes the clip's;
 
 and one file of the whole clip: mmpose's of a video (``frame_id`` and ``instances``), COCO's results
 (``image_id`` and ``keypoints``), a list of OpenPose's frames, or a table of frames by name. Any other form is
@@ -117,9 +117,8 @@ def _tables(path: Path) -> dict[str, Any] | None:
 
 
 def _by_frame_id(entries: list[Any]) -> dict[str, Any] | None:
-    if not entries or not all(
-        isinstance(one, dict) and {"frame_id", "instances"} <= set(one) for one in entries
-    ):
+    needed = {"frame_id", "instances"}
+    if not entries or not all(isinstance(one, dict) and needed <= set(one) for one in entries):
         return None
     return {str(one["frame_id"]): one["instances"] for one in entries}
 
@@ -179,6 +178,11 @@ def _people_of_table(table: dict[str, Any], path: Path, size: tuple[int, int]) -
     if "keypoints" not in table:
         known = ", ".join(sorted(map(str, table))[:6]) or "nothing"
         raise _refusal(path, f"a table of {known}")
+    return _scored(table, path)
+
+
+def _scored(table: dict[str, Any], path: Path) -> list[np.ndarray]:
+    """People of ``keypoints`` and their scores, or with the scores in them."""
     points = _array(table["keypoints"], path)
     scores = table.get("keypoint_scores", table.get("scores"))
     if scores is None:
@@ -202,9 +206,7 @@ def _openpose(table: dict[str, Any], path: Path, size: tuple[int, int]) -> list[
     if not isinstance(people, list) or not all(isinstance(one, dict) for one in people):
         raise _refusal(path, "'people' that are no list of tables")
     canvas = [table.get(name) for name in ("canvas_width", "canvas_height")]
-    scale = np.ones(2)
-    if all(isinstance(side, int | float) and side > 0 for side in canvas):
-        scale = np.array(size, float) / np.array(canvas, float)
+    named = all(isinstance(side, int | float) and side > 0 for side in canvas)
     found = []
     for one in people:
         parts = {
@@ -215,13 +217,9 @@ def _openpose(table: dict[str, Any], path: Path, size: tuple[int, int]) -> list[
             raise _refusal(path, "OpenPose's people, of which one has no x, y, score")
         points = {name: part.reshape(-1, 3) for name, part in parts.items()}
         whole = _from_openpose(points, path)
-        if (
-            whole[:, 2].any()
-            and scale.tolist() == [1, 1]
-            and all(isinstance(side, int | float) for side in canvas)
-        ):
-            whole[:, :2] *= size if np.abs(whole[:, :2]).max() <= 1 else 1  # shares of a canvas that is named
-        whole[:, :2] *= scale
+        if named:  # shares of the canvas, or its pixels
+            shares = np.abs(whole[:, :2]).max() <= _SHARES and max(size) > _SMALLEST
+            whole[:, :2] *= np.array(size) / (1 if shares else np.array(canvas, float))
         found.append(whole)
     return found
 
@@ -294,8 +292,8 @@ def _check_unit(points: np.ndarray, path: Path, size: tuple[int, int]) -> None:
     scored = points[points[:, 2] > 0, :2]
     if len(scored) >= _FEW and max(size) > _SMALLEST and np.abs(scored).max() <= _SHARES:
         raise UserError(
-            f"{path}: its points lie between {scored.min():.2f} and {scored.max():.2f}, which are shares of the "
-            f"picture and not pixels: multiply x by {size[0]} and y by {size[1]}"
+            f"{path}: its points lie between {scored.min():.2f} and {scored.max():.2f}, which are shares of "
+            f"the picture and not pixels: multiply x by {size[0]} and y by {size[1]}"
         )
 
 

@@ -49,11 +49,12 @@ def _white_is_the_person(context: Context, clip: Clip, sources: DetectionSources
     pictures = read_clip(clip, settings.stride, settings.max_frames)
     looked_at = (one for one in itertools.islice(pictures, _LOOKED_THROUGH) if one.index in masks)
     shares = []
-    estimator = None
+    estimator, sides = None, (settings.estimator_short_side, settings.estimator_long_side)
+    scale = estimator_scale(clip.width, clip.height, *sides)
     if sources.keypoints is None and sources.mediapipe is not None:
         estimator = Estimator(sources.mediapipe, context.work / "mediapipe.log", still=True)
     for picture in looked_at:
-        points = _points(clip, sources, estimator, picture)
+        points = _points(clip, sources, estimator, scale, picture)
         if points is not None:
             mask = read_given_mask(masks[picture.index], clip.width, clip.height, form)
             shares.append(share_on(points, mask > 127))
@@ -64,7 +65,7 @@ def _white_is_the_person(context: Context, clip: Clip, sources: DetectionSources
 
 
 def _points(
-    clip: Clip, sources: DetectionSources, estimator: Estimator | None, picture: SourceFrame
+    clip: Clip, sources: DetectionSources, estimator: Estimator | None, scale: float, picture: SourceFrame
 ) -> np.ndarray | None:
     """The points of the person with the best score [N, 3], pixels of the source; None without any."""
     if sources.keypoints is not None:
@@ -74,6 +75,5 @@ def _points(
         return people[int(np.argmax(people[..., 2].mean(1)))] if len(people) else None
     if estimator is None:
         return None
-    scale = estimator_scale(clip.width, clip.height, SHORT_SIDE, LONG_SIDE)
     estimate = estimator.estimate(resize(picture.image, scale))
     return None if estimate is None else to_pixels(estimate, clip.width, clip.height).pose[:, [0, 1, 3]]

@@ -79,7 +79,7 @@ def frames_of_views(
         calibration: its names are such as ``image12.jpg``, ``frames/00012.png`` or ``12``.
         clip: the footage.
         total: how many frames a video has; 0 if unknown, and then the numbers are not checked.
-        counted_from: 0 or 1 where the user says so.
+        counted_from: the first frame's number where the user says so.
 
     Raises:
         UserError: a name without a number, two names of one frame, or numbers that are no frames'.
@@ -92,8 +92,8 @@ def frames_of_views(
     if match.strangers:
         raise UserError(
             f"{path}: the picture '{match.strangers[0]}' is of no frame of {clip.path.name} "
-            f"({len(frames.numbers)} frames; {len(match.strangers)} such names): give the cameras of this clip, "
-            "named as its pictures or numbered as its frames from 0 or 1 (ingest.numbered_from says which)"
+            f"({len(frames.numbers)} frames; {len(match.strangers)} such names): give this clip's cameras, "
+            "named as its pictures or numbered from 0 or 1, or say ingest.numbered_from"
         )
     nameless = [name for name in calibration.views if name not in match.frames]
     if nameless:
