@@ -55,7 +55,8 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
     The NAME=VALUE words are ours; doit itself takes them out of its task names.
     """
     try:
-        request = parse_request(word for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
+        words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        request = parse_request(words)
         check_settings(request)
         chosen = chosen_subjects(request)
         if request.source and len(chosen) > 1:
@@ -65,7 +66,8 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
         stages = load_stages(request.workspace.stages)
         tasks = named_tasks(sys.argv[1:], stages)
         if tasks is not None:
-            check_effect(request, tasks, chosen, stages)
+            names = [word.partition("=")[0] for word in words]
+            check_effect(request, names, tasks, chosen, stages)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return request, chosen

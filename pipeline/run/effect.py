@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from pipeline.config.request import Request
-from pipeline.config.subjects import Subject
+from pipeline.config.subjects import Subject, known_subjects
 from pipeline.errors import UserError
 from pipeline.run.job import Job, open_job
 from pipeline.run.stage import Stage, upstream_first, usual
@@ -39,12 +39,17 @@ def named_tasks(words: Sequence[str], stages: Collection[str]) -> list[str] | No
 
 
 def check_effect(
-    request: Request, tasks: Sequence[str], chosen: Sequence[str], stages: Mapping[str, Stage]
+    request: Request,
+    words: Collection[str],
+    tasks: Sequence[str],
+    chosen: Sequence[str],
+    stages: Mapping[str, Stage],
 ) -> None:
     """Refuse a word that does nothing.
 
     Args:
         request: the command line.
+        words: the names that stand on it, also with their defaults.
         tasks: those that it names, such as ``fit`` or ``fit:oliver``; empty: the default ones.
         chosen: the subjects that it is about.
         stages: all, upstream first.
@@ -54,7 +59,7 @@ def check_effect(
     """
     _check_footage(request, tasks)
     _check_subjects(request, tasks, stages)
-    _check_study_words(request, tasks)
+    _check_study_words(words, tasks)
     _check_stages(request, tasks, chosen, stages)
     run = running(tasks, stages)
     if not request.overrides and request.source is None:
@@ -108,12 +113,12 @@ def _check_subjects(request: Request, tasks: Sequence[str], stages: Mapping[str,
         raise UserError(f"{words[0]} has no effect on {on}: add subject={subject}, or leave it out")
 
 
-def _check_study_words(request: Request, tasks: Sequence[str]) -> None:
-    given = request.words()
+def _check_study_words(words: Collection[str], tasks: Sequence[str]) -> None:
     for word, users in _OF_TASKS.items():
-        if word in given and not set(users) & set(tasks):
-            example = f"doit run {users[0]} {word}={given[word]}"
-            raise UserError(f"{word}= has an effect on {' and '.join(users)} alone: {example}")
+        if word in words and not set(users) & set(tasks):
+            raise UserError(
+                f"{word}= has no effect but on {' and '.join(users)}: doit run {users[0]} {word}=..."
+            )
 
 
 def running(tasks: Sequence[str], stages: Mapping[str, Stage]) -> list[str]:
@@ -154,12 +159,10 @@ def check_settings_act(job: Job, run: Collection[str]) -> None:
         for setting, remedy in stage.idle(settings).items():
             if f"{name}.{setting}" in job.request.overrides:
                 raise UserError(f"{name}.{setting} has no effect on '{subject.name}': {remedy}")
-    if job.request.source is not None and run and not _reads_source(job, run):
+    made_up = run and not any(job.stages[name].demands(job.settings[name]).source for name in run)
+    # A subject without a file must be given footage, even if its settings then make it up.
+    if job.request.source is not None and made_up and subject.name in known_subjects(job.workspace):
         raise UserError(
             f"source={job.request.source} has no effect on '{subject.name}', which is made up and not filmed "
             "(ingest.mannequin): name another subject"
         )
-
-
-def _reads_source(job: Job, run: Collection[str]) -> bool:
-    return any(job.stages[name].demands(job.settings[name]).source for name in run)
