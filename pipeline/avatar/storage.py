@@ -16,7 +16,7 @@ from pipeline.avatar.avatar import Avatar
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError
 
-FORMAT = "flexiavatar-avatar-3"
+FORMAT = "flexiavatar-avatar-4"
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
@@ -41,6 +41,8 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of the avatar holds numbers that are not finite")
     tensors["kept"] = avatar.vertex_ids
+    for place, pairs in enumerate(avatar.splits):
+        tensors[f"splits.{place}"] = pairs.int()
     header = {
         "format": FORMAT,
         "body": avatar.body_digest,
@@ -49,6 +51,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         "pose_heads_active": avatar.pose_heads_active,
         "residuals_active": avatar.residuals_active,
         "unseen": avatar.unseen,
+        "completed": bool(len(avatar.completion)),
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
@@ -98,7 +101,14 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     identity = Identity(**{field: tensors[f"identity.{field}"] for field in IDENTITY_FIELDS})
     parts = tuple(header["architecture"]["residual_parts"])  # JSON knows no tuples
     architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
-    avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=header["half_precision"])
+    splits = [tensors[name].long() for name in sorted(tensors) if name.startswith("splits.")]
+    half = header["half_precision"]
+    try:
+        avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
+    except ValueError as error:
+        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    if header["completed"]:
+        avatar.completion = torch.zeros(len(avatar.trust), 9)
     names = {_stored_name(name): name for name in avatar.state_dict()}
     weights = {
         names.get(stored, stored): tensor

@@ -17,7 +17,6 @@ from pipeline.numba_kernels import threads
 from stages.fit.camera_batch import CameraBatch
 from stages.fit.face.deca import read_flame_parameters
 from stages.fit.face.flame_model import load_flame
-from stages.fit.face.from_flame import face_from_flame
 from stages.fit.face.from_mesh import face_from_mesh
 from stages.fit.face.target import FaceModel, FaceTarget, face_model, sface
 from stages.fit.observations import Observations
@@ -63,6 +62,8 @@ def fit_face(
         if settings.face == "flame":
             folder, first = Path(settings.face_init), settings.first_number
             parameters = read_flame_parameters(folder, keypoints.frames, source, first, log)
+            from stages.fit.face.from_flame import face_from_flame  # brings trimesh: a second
+
             target = face_from_flame(model, body, load_flame(Path(settings.flame_model)), parameters)
         else:
             target = _from_mesh(model, keypoints, observations, views)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.clip.frame_files import ClipFrames, frame_files
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 
 _REMEDY = "give the folder that holds flame_params/ and shape_param.json as fit.face_init"
 
@@ -90,7 +91,7 @@ def _frame(path: Path | None) -> tuple[np.ndarray, np.ndarray] | tuple[()] | Non
 
 def _json(path: Path) -> object:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(decode_text(path.read_bytes()))
     except FileNotFoundError:
         raise UserError(f"{path} is missing: {_REMEDY}") from None
     except (OSError, ValueError, RecursionError) as error:
