@@ -18,13 +18,14 @@ from torch import Tensor, nn
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.avatar.canonical import Canonical, build_canonical
-from pipeline.avatar.representation import Condition, Decoded, Representation
+from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.representation import Condition, Decoded, LinearChange, Representation
 from pipeline.avatar.residual import regions
 from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
 from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
 from pipeline.avatar.triplane_representation import TriplaneRepresentation
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
-from pipeline.device import moved
+from pipeline.device import kernels_serve, moved
 from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
@@ -68,6 +69,8 @@ class Avatar(nn.Module):
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
+        at_once: posed in one pass over the Gaussians where that can be (``fused_posing.py``), else step by
+            step, which gives the same.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
         trust: [N, 2] in [0, 1], how far evidence bears out what was learnt of colour and of shape, see
@@ -111,6 +114,7 @@ class Avatar(nn.Module):
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
+        self.at_once = True
         self.splits = tuple(splits)
         if self.splits:
             meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
@@ -131,6 +135,7 @@ class Avatar(nn.Module):
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
         self._restricted: dict[int, tuple[Tensor, Surface]] = {}
+        self._posing: tuple[Surface, PosingTables] | None = None
         self.representation = self._make_representation(seed)
         self._baked: Decoded | None = None
 
@@ -264,12 +269,23 @@ class Avatar(nn.Module):
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        theta = pose_features(pose.rotation.detach()) if theta is None else theta
+        theta = theta if noise is None else theta + noise
+        condition = Condition(theta, pose.expression, time)
+        # One pass computes on a CPU, for all Gaussians, and knows no pose correctives.
+        if (
+            self.at_once
+            and rows is None
+            and canonical.pose_directions is None
+            and kernels_serve(decoded.offset)
+        ):
+            linear = self.representation.linear_change(decoded, condition)
+            if linear is not None:
+                return self._pose_at_once(decoded, linear, transforms, pose)
         blended = blend_transforms(transforms, canonical.skinning_weights)
         shape = decoded.offset + _rest_shape(canonical, pose)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
-        theta = pose_features(pose.rotation.detach()) if theta is None else theta
-        theta = theta if noise is None else theta + noise
-        condition, rest = Condition(theta, pose.expression, time), shape
+        rest = shape
         change = None
         if self.pose_heads_active:
             tables = decoded.surface.skinning_tables
@@ -300,6 +316,44 @@ class Avatar(nn.Module):
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
 
+    def _pose_at_once(self, decoded: Decoded, change: LinearChange, transforms: Tensor, pose: Pose) -> Posed:
+        """As ``pose`` does step by step, in one pass over the Gaussians."""
+        active = self.pose_heads_active and len(change.signal) > 0
+        posed = pose_at_once(
+            self.posing_tables(decoded.surface),
+            decoded.offset,
+            decoded.log_scale,
+            decoded.color_logit,
+            change if active else change.none(),
+            transforms,
+            pose.transl,
+            pose.expression,
+        )
+        gaussians = Gaussians(
+            posed.means,
+            posed.quaternions,
+            posed.scales,
+            posed.colors,
+            self._opacities(decoded.surface.canonical),
+        )
+        pose_offset = posed.pose_offset if active else None
+        return Posed(gaussians, pose_offset, decoded.log_scale, posed.color_logit)
+
+    def posing_tables(self, surface: Surface) -> PosingTables:
+        """The tables that posing in one pass reads of a surface, made once until another takes its place."""
+        if self._posing is None or self._posing[0] is not surface:
+            canonical = surface.canonical
+            tables = PosingTables.build(
+                surface.skinning_tables,
+                canonical.vertices,
+                *canonical.expressive(),
+                self._initial_scales(canonical),
+                self.architecture.pose_offset_unit * surface.pose_movable,
+                (*LOG_SCALE_RANGE, LARGEST_SCALE),
+            )
+            self._posing = surface, tables
+        return self._posing[1]
+
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
         """The centres, moved by what the residual heads say at rest, [N, 3]; as they are for [N, 0]."""
         if not move.shape[1]:
@@ -311,10 +365,13 @@ class Avatar(nn.Module):
         return torch.full((len(canonical),), self.architecture.opacity, device=self.device)
 
     def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
+        initial = self._initial_scales(canonical)
+        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+
+    def _initial_scales(self, canonical: Canonical) -> Tensor:
         across = canonical.spacing * self.architecture.scale
         thick = across.mean(1, keepdim=True) * self.architecture.thickness
-        initial = torch.cat([across, thick], 1)
-        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+        return torch.cat([across, thick], 1)
 
     def gaussians(
         self,

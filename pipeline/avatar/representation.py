@@ -24,8 +24,8 @@ class Decoded:
 
     Attributes:
         surface: the level that was decoded.
-        features: [N, C], what the pose-dependent part reads of each Gaussian: the triplane's ``f_i``, or the
-            linear bases.
+        features: what the pose-dependent part reads: the triplane's ``f_i``, [N, C]; or the linear bases
+            [M, C], of every Gaussian of the finest level, see ``surface.rows``.
         offset: [N, 3], Delta V_tri, metres.
         log_scale: [N, 3], S_tri, relative to the initial scale.
         color_logit: [N, 3], C_tri, before the sigmoid.
@@ -90,12 +90,35 @@ class Change:
         return Change(self.offset * shape, self.color_logit * color, log_scale)
 
 
+@dataclasses.dataclass(frozen=True)
+class LinearChange:
+    """A change that is a sum of bases, each times one number of a signal.
+
+    Attributes:
+        bases: [M, 6 K], K values each of red, green, blue (logits), x, y and z (as ``Change.offset``).
+        signal: [K], without gradient.
+        rows: [N] int64, the row of ``bases`` that is each Gaussian's; None where it is its own number.
+    """
+
+    bases: Tensor  # [M, 6 K]
+    signal: Tensor  # [K]
+    rows: Tensor | None = None  # [N]
+
+    def none(self) -> LinearChange:
+        """The same of no bases: nothing changes."""
+        return LinearChange(self.bases[:, :0].detach(), self.signal[:0], self.rows)
+
+
 class BakedRepresentation(abc.ABC):
     """The pose-dependent part of a finished avatar, ready to be evaluated without gradient."""
 
     @abc.abstractmethod
     def change(self, condition: Condition, normals: Normals) -> Change | None:
         """The change before skinning; None where there is none."""
+
+    def linear_change(self, condition: Condition) -> LinearChange | None:
+        """As ``Representation.linear_change``."""
+        return None
 
     def residuals(self, means: Tensor, condition: Condition) -> list[tuple[Tensor, Tensor]]:
         """Rows, [M], and residual colours of each part, [M, 3], or [M, 6] with moves, after skinning."""
@@ -133,6 +156,13 @@ class Representation(nn.Module, abc.ABC):
             rows: [M] int64, each at most once, the Gaussians asked for, of the others the change is zero;
                 all if None.
         """
+
+    def linear_change(self, decoded: Decoded, condition: Condition) -> LinearChange | None:
+        """The change of all Gaussians as bases and their signal; None where it is not of this kind.
+
+        Who answers has no residual colours: ``change`` is all that follows pose and face.
+        """
+        return None
 
     def residual(
         self, decoded: Decoded, means: Tensor, condition: Condition, rows: Tensor | None = None

@@ -14,6 +14,12 @@ LpipsNetwork = Literal["alex", "vgg"]
 ResidualPlace = Literal["canonical", "posed"]
 """The place of a Gaussian that its residual head is told; see ``pipeline.avatar.residual``."""
 
+UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""The axis of a motion's world that points up."""
+
+Up = Literal["auto", UpAxis]
+"""An axis, or the one that ``pipeline.motion.up_axis`` finds."""
+
 BodyPart = Literal[
     "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg"
 ]  # fmt: skip

@@ -23,6 +23,8 @@ from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import ever_in_frame
 
+FRAMES_A_BASIS = 8  # training frames for one more: with fewer it learns the clip by heart
+
 
 def initial_avatar(
     data: TrainingData,
@@ -139,7 +141,8 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
         return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
     remembered |= {"plane_resolution": 2, "plane_channels": 1}  # there are no planes
     features = signal_features(conditions.theta, conditions.expression, expressions)
-    bases = len(fit_driving_signal(features, settings.bases))
+    few_frames = max(1, len(features) // FRAMES_A_BASIS)
+    bases = len(fit_driving_signal(features, min(settings.bases, few_frames)))
     return Architecture(**remembered, pose_heads=bases > 0, bases=bases)
 
 

@@ -86,9 +86,11 @@ class TrainSettings:
     representation: Literal["bases", "triplane"] = setting(
         "bases", "each Gaussian's own parameters and bases, or the paper's triplane and heads"
     )
-    # A prototype on smile: 35.8, 36.5 and 35.9 dB with 0, 8 and 16; more learn the clip by heart.
+    # smile (65 frames) lost 0.1 dB with 16 of them, carphone (108) gained 0.8 over 8 (docs/results.md).
     bases: BasesCount = setting(
-        8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
+        16,
+        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction that "
+        "the clip does not move in",
     )
     edge_pixels: EdgePixels | None = setting(
         None,

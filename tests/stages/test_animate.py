@@ -205,6 +205,13 @@ def test_a_turntable_stands_still_and_goes_round(studio):
     assert json.loads((context.output / "animate.json").read_text())["motion"] == "turntable"
 
 
+def test_a_run_says_which_settings_have_no_effect(studio, capsys):
+    context = studio.animate("idle", up="z", turntable_frames=2)
+    found = json.loads((context.output / "animate.json").read_text())
+    assert len(found["without_effect"]) == 1 and "animate.up=z" in found["without_effect"][0]
+    assert "animate.up=z" in capsys.readouterr().out
+
+
 def test_an_orbit_goes_round_a_moving_body_and_nothing_is_cut_off(studio, walk):
     context = studio.animate("round", motion=str(walk), camera="orbit", outputs=("exr",))
     cameras = read_cameras(context.output / "cameras.parquet")

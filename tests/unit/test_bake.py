@@ -11,7 +11,8 @@ from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import bake
 from pipeline.avatar.fused_head import HeadParameters, decode
 from pipeline.avatar.head import Head
-from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points, normals_of_vertices
+from pipeline.avatar.skinning_kernels import normals_of_vertices
+from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points
 from pipeline.body import Pose, mean_identity, vertex_normals
 from pipeline.clip.camera import facing_camera
 from pipeline.numba_kernels import threads

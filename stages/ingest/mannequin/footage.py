@@ -51,6 +51,7 @@ class Filming:
         spec: what is filmed.
         scene: bodies and cameras.
         places: the places of joints and landmarks.
+        notes: what a user should know of the motion's file, a sentence each.
         point_states: [T, K] uint8, their states, known once all the pictures have been taken.
     """
 
@@ -69,7 +70,7 @@ class Filming:
             spec, rest_joints(body, identity), body.parents, body.expression_directions.shape[2]
         )
         shot = frame_motion(spec, body, clothed, motion)
-        self.identity = identity
+        self.identity, self.notes = identity, motion.notes
         self.scene = make_scene(body, clothed, appearance, shot, spec.seed)
         self.places: BodyPoints = pose_points(body, landmarks, identity, shot.poses)
         self.point_states = np.zeros(self.places.world.shape[:2], np.uint8)
@@ -163,6 +164,8 @@ def run_mannequin(context: Context) -> None:
             cameras[row] = camera
         write_foreground(output / "views" / name, sorted(cameras), learn=False)
         write_cameras(output / "views" / name / "cameras.parquet", cameras)
+    for note in filming.notes:
+        context.log(note)
     context.log(
         f"{spec.frames} frames of a mannequin, {spec.framing} framing, {len(split.test)} of them held out"
     )
