@@ -31,6 +31,7 @@ from pipeline.config.request import Request, parse_request
 from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.doit_reporter import summarising
+from pipeline.run.effect import check_effect, named_tasks
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
@@ -54,13 +55,19 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
     The NAME=VALUE words are ours; doit itself takes them out of its task names.
     """
     try:
-        request = parse_request(word for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
+        words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        request = parse_request(words)
         check_settings(request)
         chosen = chosen_subjects(request)
         if request.source and len(chosen) > 1:
             raise UserError("source= names the footage of one subject; run the subjects one by one")
         for subject in request.subjects:
             load_subject(request.workspace, subject, request.source, request.dataset)
+        stages = load_stages(request.workspace.stages)
+        tasks = named_tasks(sys.argv[1:], stages)
+        if tasks is not None:
+            names = [word.partition("=")[0] for word in words]
+            check_effect(request, names, tasks, chosen, stages)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return request, chosen

@@ -73,11 +73,17 @@ class Avatar(nn.Module):
             step, which gives the same.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
+        trust: [N, 2] in [0, 1], how far evidence bears out what was learnt of colour and of shape, see
+            ``evidence.py``; 1 before that is known.
+        completion: [N, 9], offset, log scale and colour logits of the finished avatar where the
+            representation cannot hold them, see ``completion.py``; [0, 9] where it does not need to.
     """
 
     base_color: Tensor
     active: Tensor
     skin_rows: Tensor
+    trust: Tensor
+    completion: Tensor
 
     def __init__(
         self,
@@ -124,6 +130,8 @@ class Avatar(nn.Module):
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
         self.register_buffer("active", torch.ones(len(vertex_ids), dtype=torch.bool))
         self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
+        self.register_buffer("trust", torch.ones(len(meshes[-1]), 2))
+        self.register_buffer("completion", torch.zeros(0, 9))
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
         self._restricted: dict[int, tuple[Tensor, Surface]] = {}
@@ -215,7 +223,29 @@ class Avatar(nn.Module):
     def decode(self, level: int = -1) -> Decoded:
         """The pose-independent part, on one level of subdivision (the finest by default)."""
         surface = self.surface(level)
-        return self.representation.decode(surface, surface.pick(self.base_color))
+        decoded = self.representation.decode(surface, surface.pick(self.base_color))
+        if not len(self.completion):
+            return decoded
+        offset, log_scale, color_logit = surface.pick(self.completion).split(3, dim=1)
+        return dataclasses.replace(decoded, offset=offset, log_scale=log_scale, color_logit=color_logit)
+
+    @torch.no_grad()
+    def take_completion(self, rows: Tensor, completed: Decoded) -> None:
+        """Takes completed values for its own; what follows the pose fades out with trust.
+
+        Args:
+            rows: [M] int64, which Gaussians of the finest level.
+            completed: their pose-independent part.
+        """
+        trust, base = self.trust[rows], self.base_color[rows]
+        if not self.representation.take_completion(rows, completed, base, trust):
+            values = torch.cat([completed.offset, completed.log_scale, completed.color_logit], 1)
+            self.completion = self.trust.new_zeros(len(self.trust), 9).index_copy_(0, rows, values)
+        self._baked = None
+
+    def pose_share(self, surface: Surface) -> Tensor | None:
+        """The share that is shown of what follows the pose, colour and shape, [N, 2]; None for all."""
+        return surface.pick(self.trust) if len(self.completion) else None
 
     def pose(
         self,
@@ -262,7 +292,9 @@ class Avatar(nn.Module):
             change = self.representation.change(
                 decoded, condition, lambda: tables.normals(transforms, rest), rows
             )
+        share = self.pose_share(decoded.surface)
         if change is not None:
+            change = change if share is None else change.scaled(share)
             pose_offset = change.offset * self.architecture.pose_offset_unit * decoded.surface.pose_movable
             shape = shape + pose_offset
             log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
@@ -272,6 +304,7 @@ class Avatar(nn.Module):
         if self.residuals_active:
             answer = self.representation.residual(decoded, means, condition, rows)
         if answer is not None:
+            answer = answer if share is None else scaled_residual(answer, share)
             residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(
@@ -406,6 +439,11 @@ def pose_features(rotation: Tensor) -> Tensor:
     """
     matrices = roma.rotvec_to_rotmat(rotation[1:])
     return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
+
+
+def scaled_residual(answer: Tensor, share: Tensor) -> Tensor:
+    """A share, [N, 2], of residual colours and moves: [N, 3] or [N, 6]."""
+    return torch.cat([answer[:, :3] * share[:, :1], answer[:, 3:] * share[:, 1:]], 1)
 
 
 def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:

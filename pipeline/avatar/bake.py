@@ -15,7 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features, scaled_residual
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
 from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded, LinearChange
 from pipeline.avatar.skinning_tables import SkinningTables
@@ -36,6 +36,7 @@ class Constants:
         log_scale, color_logit: [N, 3], of the static heads.
         offset_unit: [N, 1], metres that a pose-dependent offset of 1 stands for.
         joints: [55, 3], metres.
+        pose_share: [N, 2], the share that is shown of what follows the pose, colour and shape; None for all.
     """
 
     points: Tensor
@@ -47,6 +48,7 @@ class Constants:
     color_logit: Tensor
     offset_unit: Tensor
     joints: Tensor
+    pose_share: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,12 +98,16 @@ class BakedAvatar:
         points = rest = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         change = self.representation.change(condition, lambda: self.skinning_tables.normals(transforms, rest))
+        share = constants.pose_share
         if change is not None:
+            change = change if share is None else change.scaled(share)
             points = torch.addcmul(points, change.offset, constants.offset_unit)
             log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
             color_logit = color_logit + change.color_logit
         means, quaternions = self.skinning_tables.place(transforms, points, pose.transl)
         answers = self.representation.residuals(means, condition)
+        if share is not None:
+            answers = [(rows, scaled_residual(answer, share[rows])) for rows, answer in answers]
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
@@ -182,4 +188,5 @@ def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
         color_logit=decoded.color_logit.contiguous(),
         offset_unit=sizes.pose_offset_unit * decoded.surface.pose_movable,
         joints=canonical.joints,
+        pose_share=avatar.pose_share(decoded.surface),
     )

@@ -137,6 +137,19 @@ class BasesRepresentation(Representation):
         """Sets the bases of Gaussians that no frame showed to zero: smoothness alone has moved them."""
         self.bases[~seen] = 0.0
 
+    @torch.no_grad()
+    def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
+        """Takes the values as its own parameters: True."""
+        # What is fully trusted stays as it is, to the byte.
+        some = (share < 1).any(1)
+        chosen = rows[some]
+        self.offset[chosen] = completed.offset[some] / self._offset_unit
+        self.log_scale[chosen] = completed.log_scale[some]
+        self.color[chosen] = (completed.color_logit - base_color)[some]
+        each = share[some].repeat_interleave(3, 1)  # red, green, blue, x, y, z
+        self.bases[chosen] *= each.repeat_interleave(len(self), 1)
+        return True
+
 
 @dataclasses.dataclass(frozen=True)
 class BakedBases(BakedRepresentation):

@@ -19,6 +19,7 @@ from pipeline.body import PARTS, Pose, edges, joint_transforms
 from pipeline.body.edge_splits import split_edges
 from pipeline.clip.camera import Camera, project
 
+DENSITY_FRAMES = 12  # training frames, evenly spread, in which edges are measured
 MOST_ROUNDS = 6  # a sixty-fourth of an edge
 FACING = 0.1  # cosine of the angle between normal and line of sight: seen more obliquely counts as unseen
 

@@ -83,6 +83,12 @@ class Change:
     color_logit: Tensor
     log_scale: Tensor | None = None
 
+    def scaled(self, share: Tensor) -> Change:
+        """A share of it, [N, 2]: of the colour and of the rest."""
+        color, shape = share[:, :1], share[:, 1:]
+        log_scale = None if self.log_scale is None else self.log_scale * shape
+        return Change(self.offset * shape, self.color_logit * color, log_scale)
+
 
 @dataclasses.dataclass(frozen=True)
 class LinearChange:
@@ -193,5 +199,19 @@ class Representation(nn.Module, abc.ABC):
         """Undoes what was learnt where nothing was to be seen; called once, after training.
 
         Args:
-            seen: [N] bool, the Gaussians of the finest level that a training frame showed.
+            seen: [N] bool, the Gaussians of the finest level of which there is any evidence.
         """
+
+    def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
+        """Takes completed values for what it decodes to, and lets what follows the pose fade.
+
+        Args:
+            rows: [M] int64, which Gaussians of the finest level.
+            completed: their pose-independent part.
+            base_color: [M, 3], what their colours are added to.
+            share: [M, 2] in [0, 1], of colours and of places that follow the pose that is left.
+
+        Returns:
+            False if it cannot, because its values are not a Gaussian's own: the avatar keeps them then.
+        """
+        return False

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import torch
-import trimesh
 from torch import Tensor
 
 from pipeline.body import (
@@ -93,7 +92,8 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         def report(note: str) -> None:
             progress.advance(1, note)
 
-        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log)
+        source = read_footage(ingest / "footage.json").all_frames
+        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log, source)
     return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
 
 
@@ -143,6 +143,8 @@ def write_residuals(path: Path, error: Tensor, observations: Observations) -> No
 
 def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
     """Write the identity's mesh in T pose as binary PLY, metres."""
+    import trimesh  # a second of the stage's start, were it above
+
     with torch.no_grad():
         vertices = rest_vertices(body, identity).numpy()
     mesh = trimesh.Trimesh(vertices, body.faces.numpy(), process=False)
