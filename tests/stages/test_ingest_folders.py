@@ -44,7 +44,7 @@ def ingest(material: Path, name: str = "run", source: str = "clip.mp4", **settin
 
 def test_everything_is_published(material: Path) -> None:
     output = ingest(material)
-    expected = {"frames", "masks", "keypoints.parquet", "cameras.parquet", "split.json", "footage.json",
+    expected = {"frames", "masks", "foreground", "keypoints.parquet", "cameras.parquet", "split.json", "footage.json",
                 "preview.png"}  # fmt: skip
     assert {path.name for path in output.iterdir()} == expected
     truth, masks = walking_blob(COUNT)
