@@ -2,8 +2,8 @@
 
 ITU-R BT.2100 turns HLG and PQ into light on a display; BT.2408 puts the white of ordinary pictures at
 203 cd/m². Light up to 85% of it is kept as it is; what is brighter, up to a display's peak, is bent into the
-rest by one factor for the three colours, which keeps the hue. PyAV's FFmpeg has no zimg, whose filter does the
-like.
+rest by one factor for the three colours, which keeps the hue. PyAV's FFmpeg has no zimg, whose filter does
+the like.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def mapping_note(path: object, frame: av.VideoFrame) -> str:
         return (
             f"{name} with {primaries}'s primaries, tone mapped to sRGB (BT.2100, white at {WHITE:.0f} cd/m²)"
         )
-    return f"SDR with {primaries}'s primaries, converted to BT.709's" if needs_mapping(frame) else ""
+    return f"SDR, {primaries}'s primaries: converted to BT.709's" if needs_mapping(frame) else ""
 
 
 def map_picture(coded: np.ndarray, transfer: int, primaries: int) -> np.ndarray:
