@@ -33,3 +33,6 @@ Refinement = Literal["plan", "on", "off"]
 
 ProtocolName = Literal["ours", "paper", "paper_black"]
 """Named sets of the three choices before; see ``pipeline.config.evaluation_protocol``."""
+
+UpAxis = Literal["-y", "y", "z"]
+"""The axis that points up in the world of a file for other programs; ours is y."""

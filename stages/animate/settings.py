@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from pipeline.config.choices import UpAxis
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
 from stages.animate.motions.source import TURNTABLE, motion_source
@@ -62,6 +63,9 @@ class AnimateSettings:
     )
     up: Literal["auto", "y", "z"] = setting(
         "auto", "the axis that is up in an .npz; auto: the one along which its body stands"
+    )
+    ply_up: UpAxis = setting(
+        "y", "the axis that points up in ply/: y as in cameras.parquet; most viewers show -y upright"
     )
     background: ColorName | HexColor = setting(
         "grey", "behind the video's person; OpenEXR has an alpha instead"
