@@ -9,6 +9,7 @@ once, ``pose`` as often as needed; a finished avatar does so by itself.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import roma
 import torch
@@ -61,6 +62,7 @@ class Avatar(nn.Module):
         vertex_ids: [K] int64, the body vertices that carry Gaussians; on the CPU, wherever the avatar is.
         identity: the fitted identity; on the CPU, too.
         body_digest: of the body model that it was built on.
+        splits: rounds of edges whose splitting makes the finest level; none where subdivision does.
         surfaces: every level from the unsubdivided mesh to the finest, with nothing gated.
         active: [K] bool, these vertices that the visibility gate leaves; see ``surface``.
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
@@ -82,6 +84,7 @@ class Avatar(nn.Module):
         architecture: Architecture,
         seed: int = 0,
         half_precision: bool = True,
+        splits: Sequence[Tensor] = (),
     ):
         """A new avatar: the fitted body in grey.
 
@@ -92,15 +95,22 @@ class Avatar(nn.Module):
             architecture: sizes.
             seed: of the initial weights.
             half_precision: heads in bfloat16 where that is faster, see ``pipeline.device.product_dtype``.
+            splits: rounds of edges whose splitting makes the finest level, see ``density.py``; midpoint
+                subdivision makes it if there are none.
+
+        Raises:
+            ValueError: ``splits`` name an edge that the mesh has not.
         """
         super().__init__()
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
-        meshes = [
-            build_canonical(body, identity, level, vertex_ids)
-            for level in range(architecture.subdivisions + 1)
-        ]
+        self.splits = tuple(splits)
+        if self.splits:
+            meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
+        else:
+            levels = range(architecture.subdivisions + 1)
+            meshes = [build_canonical(body, identity, level, vertex_ids) for level in levels]
         planes, self.boxes = plane_regions(meshes[-1])
         residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
         self.surfaces = [
@@ -165,7 +175,8 @@ class Avatar(nn.Module):
             return full
         known = self._restricted.get(level)
         if known is None or not torch.equal(known[0], self.active):
-            rows = active_rows(self.surfaces[0].canonical, self.active, level)
+            levels, splits = (0, self.splits) if self.splits and level else (level, ())
+            rows = active_rows(self.surfaces[0].canonical, self.active, levels, splits)
             known = self._restricted[level] = self.active.clone(), restricted(full, rows)
         return known[1]
 

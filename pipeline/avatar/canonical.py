@@ -10,6 +10,7 @@ Canonical positions are those of the rest pose, in metres, Y up, the subject's l
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -27,6 +28,7 @@ from pipeline.body import (
     subdivide,
     vertex_normals,
 )
+from pipeline.body.edge_splits import split_repeatedly
 from pipeline.body.mesh import close_mouth
 
 HEAD = ("head", "face")
@@ -95,7 +97,11 @@ def dilate(mask: Tensor, faces: Tensor, rings: int) -> Tensor:
 
 
 def build_canonical(
-    body: BodyModel, identity: Identity, levels: int, vertex_ids: Tensor | None = None
+    body: BodyModel,
+    identity: Identity,
+    levels: int,
+    vertex_ids: Tensor | None = None,
+    splits: Sequence[Tensor] = (),
 ) -> Canonical:
     """The canonical mesh of one identity.
 
@@ -105,9 +111,11 @@ def build_canonical(
         levels: of midpoint subdivision: 0, 1 or 2.
         vertex_ids: [K] int64, body vertices that stay, sorted; all of them if None. A triangle stays if
             its three vertices do, a vertex stays even when no triangle of it does.
+        splits: rounds of edges that are split instead, see ``density.py``; with ``levels`` 0.
 
     Raises:
-        ValueError: if ``vertex_ids`` is empty or names a vertex that the body has not.
+        ValueError: if ``vertex_ids`` is empty or names a vertex that the body has not, or ``splits`` an edge
+            that the mesh has not.
     """
     vertices = rest_vertices(body, identity)
     faces = close_mouth(vertices, body.faces)
@@ -126,6 +134,7 @@ def build_canonical(
         carried.append(body.pose_directions)
     faces = faces_among(faces, vertex_ids, len(vertices))
     faces, attributes = subdivide(faces, *(attribute[vertex_ids] for attribute in carried), levels=levels)
+    faces, attributes = split_repeatedly(faces, splits, *attributes)
     vertices, weights, directions, labels, normals, *correctives = attributes
     frames = tangent_frames(functional.normalize(normals, dim=-1))
     return Canonical(

@@ -41,6 +41,8 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of the avatar holds numbers that are not finite")
     tensors["kept"] = avatar.vertex_ids
+    for place, pairs in enumerate(avatar.splits):
+        tensors[f"splits.{place}"] = pairs.int()
     header = {
         "format": FORMAT,
         "body": avatar.body_digest,
@@ -98,7 +100,12 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     identity = Identity(**{field: tensors[f"identity.{field}"] for field in IDENTITY_FIELDS})
     parts = tuple(header["architecture"]["residual_parts"])  # JSON knows no tuples
     architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
-    avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=header["half_precision"])
+    splits = [tensors[name].long() for name in sorted(tensors) if name.startswith("splits.")]
+    half = header["half_precision"]
+    try:
+        avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
+    except ValueError as error:
+        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
     names = {_stored_name(name): name for name in avatar.state_dict()}
     weights = {
         names.get(stored, stored): tensor

@@ -8,6 +8,7 @@ no product any more, so that their gradient is exactly zero.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.avatar.sparse import SparsePair
 from pipeline.avatar.triplane import bounding_boxes, normalise, sampling_matrix
 from pipeline.body import subdivide
+from pipeline.body.edge_splits import split_repeatedly
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +72,7 @@ def build_surface(
     return Surface(mesh, samples, mesh.neighbour_mean(), pose_movable, SkinningTables.build(mesh), residual)
 
 
-def active_rows(coarse: Canonical, active: Tensor, level: int) -> Tensor:
+def active_rows(coarse: Canonical, active: Tensor, level: int, splits: Sequence[Tensor] = ()) -> Tensor:
     """The vertices of a level of subdivision that stay, [N] int64.
 
     One that was put between others stays if all of them do, as if the mesh had been gated first and
@@ -80,8 +82,10 @@ def active_rows(coarse: Canonical, active: Tensor, level: int) -> Tensor:
         coarse: the unsubdivided mesh, [K] vertices.
         active: [K] bool, those of its vertices that stay.
         level: of subdivision.
+        splits: rounds of edges that were split instead.
     """
-    _, (share,) = subdivide(coarse.faces, active.float()[:, None], levels=level)
+    faces, (share,) = subdivide(coarse.faces, active.float()[:, None], levels=level)
+    _, (share,) = split_repeatedly(faces, splits, share)
     return torch.nonzero(share[:, 0] == 1)[:, 0]
 
 

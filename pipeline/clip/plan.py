@@ -29,6 +29,7 @@ DECIDED = (
     "right_hand_residual",
     "face_loss",
     "subdivision",
+    "gaussians",
     "pose_heads",
     "visibility_gate",
     "auxiliary_views",
@@ -37,10 +38,13 @@ DECIDED = (
 )
 """Decided by the plan stage, which has a setting (``on``, ``off`` or ``auto``) of each name."""
 
+COUNTED = ("steps",)
+"""A number for training that is neither on nor off; ``train.iterations`` is asked instead where it is set."""
+
 SEEN_PARTS = tuple(f"seen_{part}" for part in get_args(BodyPart))
 """One for each part of the body: is it ever seen? Measured as the share of training frames that show it."""
 
-EFFECTS = (*GATHERED, *DECIDED, *SEEN_PARTS)
+EFFECTS = (*GATHERED, *DECIDED, *COUNTED, *SEEN_PARTS)
 
 AZIMUTH_STEP = 30  # degrees, of the bins in which auxiliary_views counts what was never seen
 
@@ -62,7 +66,8 @@ class Decision:
         values: what else was measured. Of ``auxiliary_views``: the azimuths that no training frame
             saw, centres of bins of ``AZIMUTH_STEP`` degrees. Azimuth 0 is a camera in front of the
             person, 90 one on the person's left, 180 one behind. Of ``subdivision``: how many levels the
-            pixels call for.
+            pixels call for. Of ``gaussians``: how many each of ``pipeline.body.PARTS`` gets; edges are split
+            down to the threshold. Of ``steps``: how many optimiser steps.
     """
 
     effect: str

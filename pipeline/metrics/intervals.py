@@ -19,7 +19,7 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,4 +88,4 @@ def stretch(blocks: int, tail: float) -> float:
     """
     if blocks < 2:
         return 1.0
-    return float(t.ppf(1 - tail, blocks - 1) / norm.ppf(1 - tail)) * math.sqrt(blocks / (blocks - 1))
+    return float(stdtrit(blocks - 1, 1 - tail) / ndtri(1 - tail)) * math.sqrt(blocks / (blocks - 1))

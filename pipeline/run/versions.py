@@ -13,7 +13,6 @@ PACKAGES = (
     "torch",
     "numpy",
     "numba",
-    "torchmetrics",
     "opencv-contrib-python-headless",
     "av",
     "roma",

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import torch
-import trimesh
 from torch import Tensor
 
 from pipeline.body import (
@@ -143,6 +142,8 @@ def write_residuals(path: Path, error: Tensor, observations: Observations) -> No
 
 def write_template(path: Path, body: BodyModel, identity: Identity) -> None:
     """Write the identity's mesh in T pose as binary PLY, metres."""
+    import trimesh  # a second of the stage's start, were it above
+
     with torch.no_grad():
         vertices = rest_vertices(body, identity).numpy()
     mesh = trimesh.Trimesh(vertices, body.faces.numpy(), process=False)

@@ -5,7 +5,7 @@ from stages.plan.settings import PlanSettings
 
 STAGE = Stage(
     name="plan",
-    version=3,
+    version=4,
     settings=PlanSettings,
     run="stages.plan.run:run",
     needs={

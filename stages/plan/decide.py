@@ -9,11 +9,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeline.avatar.otsu_threshold import LEAST_CUT, evidence_threshold
-from pipeline.body import rest_joints
-from pipeline.clip.plan import EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
+from pipeline.body import PARTS, rest_joints
+from pipeline.clip.plan import COUNTED, EFFECTS, GATHERED, SEEN_PARTS, Decision, Plan
 from stages.plan.measure import (
     PlanInputs,
     gaussian_pixels,
+    gaussians_by_part,
     mean_error,
     part_pixels,
     pose_change,
@@ -37,6 +38,10 @@ RESIDUAL_PIXELS = 32.0
 # and a head of 3.8 a third (docs/log/2026-11.md).
 GAUSSIAN_PIXELS = 1.5
 
+# Steps of a clip of so many frames; those of others grow with the root of their number, within limits.
+STEPS, STEPS_FRAMES = 500, 65
+LEAST_STEPS, MOST_STEPS = 0.8, 2.0
+
 # Of the person's size. Mannequins that stand still, head and upper body: 0.031 and 0.028, which is what the
 # detector's errors leave; those that move: 0.138 and more.
 POSE_CHANGE = 0.045
@@ -59,6 +64,8 @@ def decide(inputs: PlanInputs, settings: PlanSettings) -> Plan:
         gate(scores),
         azimuths(inputs),
         subdivision(inputs),
+        gaussians(inputs, settings.edge_pixels),
+        steps(inputs),
         poses_follow(inputs),
         refinement(inputs),
         test_time(inputs),
@@ -72,7 +79,7 @@ def decide(inputs: PlanInputs, settings: PlanSettings) -> Plan:
 
 def forced(decision: Decision, settings: PlanSettings) -> Decision:
     """A decision, replaced by its setting where that is not ``auto``."""
-    if decision.effect in GATHERED:
+    if decision.effect in (*GATHERED, *COUNTED):
         return decision
     choice = getattr(settings, decision.effect)
     if choice == "auto":
@@ -160,6 +167,26 @@ def subdivision(inputs: PlanInputs) -> Decision:
     levels = max(0, math.ceil(math.log2(pixels / GAUSSIAN_PIXELS))) if pixels else 0
     why = f"the body's vertices that a training frame shows stand {pixels:.1f} pixels apart"
     return Decision("subdivision", levels > 0, pixels, GAUSSIAN_PIXELS, "pixels apart", why, values=(levels,))
+
+
+def gaussians(inputs: PlanInputs, edge_pixels: float) -> Decision:
+    """On if there are more pixels than Gaussians; its values are their numbers by part of the body."""
+    counts = gaussians_by_part(inputs, edge_pixels)
+    pixels, total = gaussian_pixels(inputs), sum(counts.values())
+    most = sorted(counts, key=lambda part: -counts[part])[:3]
+    shares = ", ".join(f"{part.replace('_', ' ')} {counts[part]:,}" for part in most if counts[part])
+    why = f"{total:,} Gaussians leave no edge longer than {edge_pixels:g} pixels, most of them: {shares}"
+    numbers = tuple(counts[part] for part in PARTS)
+    return Decision("gaussians", True, pixels, edge_pixels, "pixels between vertices", why, values=numbers)
+
+
+def steps(inputs: PlanInputs) -> Decision:
+    """The number of optimiser steps: more frames have more to teach, but not as many times more."""
+    frames = len(inputs.clip.split.train)
+    factor = min(max(math.sqrt(frames / STEPS_FRAMES), LEAST_STEPS), MOST_STEPS)
+    count = 10 * round(STEPS * factor / 10)
+    why = f"{frames} training frames: {count:,} steps, {count / frames:.1f} visits of each"
+    return Decision("steps", True, frames, STEPS_FRAMES, "training frames", why, values=(count,))
 
 
 def poses_follow(inputs: PlanInputs) -> Decision:

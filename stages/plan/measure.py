@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar import Architecture, Avatar, Surface
+from pipeline.avatar.density import DENSITY_FRAMES, choose_splits, count_by_part, project_surface
 from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import PARTS, pose_body
 from pipeline.clip.boxes import MARGIN
@@ -53,6 +55,13 @@ class PlanInputs:
     errors: Mapping[int, float]
     face: Mapping[str, Any]
 
+    @cached_property
+    def surface(self) -> Surface:
+        """The body's mesh with the clip's identity."""
+        bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+        body = self.clip.body
+        return Avatar(body, self.clip.identity, torch.arange(len(body.v_template)), bare).surfaces[0]
+
 
 def read_inputs(ingest: Path, fit: Path, body_file: Path) -> PlanInputs:
     """Read what ingest and fit published.
@@ -90,9 +99,7 @@ def visibility(inputs: PlanInputs) -> tuple[np.ndarray, dict[str, float]]:
         The scores, [V] in [0, 1], and for each part of the body the largest share of its vertices that a
         training frame shows.
     """
-    clip, cameras = inputs.clip, inputs.cameras
-    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
-    surface = Avatar(clip.body, clip.identity, torch.arange(len(clip.body.v_template)), bare).surfaces[0]
+    clip, cameras, surface = inputs.clip, inputs.cameras, inputs.surface
     labels = surface.canonical.parts
     size = torch.bincount(labels, minlength=len(PARTS)).clamp_min(1)
     hits, most = torch.zeros(len(labels)), torch.zeros(len(PARTS))
@@ -132,6 +139,27 @@ def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
     seen = facing & ((middle > 0) & (middle < size)).all(1) & (depth[faces.long()] > 0).all(1)
     # A closed mesh has two faces a vertex.
     return math.sqrt(float(area[seen].abs().sum()) / (int(seen.sum()) / 2)) if seen.any() else 0.0
+
+
+def gaussians_by_part(inputs: PlanInputs, edge_pixels: float) -> dict[str, int]:
+    """The Gaussians that the pixels call for, by part of the body.
+
+    They are the vertices that some training frame has in its picture, and those that splitting its edges adds
+    (``pipeline.avatar.density``).
+
+    Args:
+        inputs: of the plan.
+        edge_pixels: no edge between neighbours is longer than this in a frame that shows it.
+    """
+    clip, surface = inputs.clip, inputs.surface
+    frames = [(clip.pose(frame), inputs.cameras[frame]) for frame in clip.spread(DENSITY_FRAMES)]
+    splits = choose_splits(surface.canonical.faces, project_surface(surface, frames), edge_pixels)
+    seen = torch.zeros(len(surface.canonical), dtype=torch.bool)
+    for frame in clip.split.train:
+        seen |= body_in_frame(surface, clip.pose(frame), inputs.cameras[frame])
+    added = count_by_part(surface.canonical.parts, splits)
+    hidden = torch.bincount(surface.canonical.parts[~seen], minlength=len(PARTS)).tolist()
+    return {part: added[part] - unseen for part, unseen in zip(PARTS, hidden, strict=True)}
 
 
 def part_pixels(clip: FittedClip, part: str) -> float:

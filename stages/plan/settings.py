@@ -6,13 +6,15 @@ registration by ``fit.face``; the plan gathers what came of them.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from pipeline.config.settings import SETTINGS, setting
 
 Choice = Literal["auto", "on", "off"]
+Pixels = Annotated[float, Field(ge=0.5, le=1000)]
 
 
 @dataclass(frozen=True, config=SETTINGS)
@@ -28,6 +30,12 @@ class PlanSettings:
     subdivision: Choice = setting(
         "auto",
         "finer Gaussians, up to train.subdivisions; auto: as fine as the pixels",
+    )
+    gaussians: Choice = setting(
+        "auto", "the bases' Gaussians as dense as the pixels; off: train.subdivisions on the body's vertices"
+    )
+    edge_pixels: Pixels = setting(
+        3.0, "longest edge between neighbouring Gaussians in a training frame; longer ones are split"
     )
     pose_heads: Choice = setting("auto", "shape and colour that follow the pose")
     visibility_gate: Choice = setting("auto", "no Gaussians for what is seen too seldom")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.density import DENSITY_FRAMES, choose_splits, project_surface
 from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
 from pipeline.device import moved
@@ -33,7 +34,7 @@ def initial_avatar(
     Args:
         data: what it will be learnt from.
         refinement: the fitted poses.
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         log: for a line with the numbers of vertices and Gaussians.
 
     Returns:
@@ -47,7 +48,9 @@ def initial_avatar(
     rows = torch.nonzero(kept | (settings.unseen == "base"))[:, 0]
     clip, conditions = data.clip, clip_conditions(data)
     sizes = architecture(settings, conditions, clip.body.expression_directions.shape[-1])
-    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, settings.half_precision)
+    splits = splits_of(data, refinement, rows, settings)
+    half = settings.half_precision
+    avatar = Avatar(clip.body, clip.identity, rows, sizes, settings.seed, half, splits)
     avatar.to(refinement.poses.rotation.device)
     avatar.pose_heads_active = avatar.residuals_active = False
     avatar.representation.set_clip(moved(conditions, avatar.device))
@@ -85,6 +88,19 @@ def kept_vertices(data: TrainingData, refinement: PoseRefinement, settings: Trai
     return dilate(seen, body.surfaces[0].canonical.faces, settings.gate_rings).cpu()
 
 
+def splits_of(
+    data: TrainingData, refinement: PoseRefinement, vertex_ids: Tensor, settings: TrainSettings
+) -> tuple[Tensor, ...]:
+    """The edges that are split before training, see ``pipeline.avatar.density``; none for a triplane."""
+    if settings.representation == "triplane" or not settings.edge_pixels:
+        return ()
+    clip = data.clip
+    bare = Architecture(plane_resolution=2, plane_channels=1, subdivisions=0)
+    surface = Avatar(clip.body, clip.identity, vertex_ids, bare).surfaces[0]
+    frames = [(clip.pose(frame), data.crops.camera(frame)) for frame in clip.spread(DENSITY_FRAMES)]
+    return choose_splits(surface.canonical.faces, project_surface(surface, frames), settings.edge_pixels)
+
+
 def clip_conditions(data: TrainingData) -> ClipConditions:
     """The fitted poses, expressions and times of the captured training frames, on the CPU.
 
@@ -108,7 +124,7 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
     """The part of the settings that an avatar's file has to remember; no more bases than the clip drives.
 
     Args:
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         conditions: of the training frames.
         expressions: of the body.
     """

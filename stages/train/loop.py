@@ -130,7 +130,7 @@ class Trainer:
     def level(self) -> int:
         """The level of subdivision that is trained now."""
         fine = schedule.reached(self.settings, self.settings.subdivide_from, self.iteration)
-        return self.settings.subdivisions if fine else 0
+        return len(self.avatar.surfaces) - 1 if fine else 0
 
     def checkpoint(self, key: str) -> Checkpoint:
         """A checkpoint with all of the state.

@@ -24,7 +24,11 @@ from stages.train.objective import describe_objective
 from stages.train.poses import PoseRefinement
 from stages.train.publish import publish
 from stages.train.schedule import step_costs
-from stages.train.settings import TrainSettings, apply_plan, apply_representation
+from stages.train.settings import (
+    TrainSettings,
+    apply_plan,
+    settings_without_effect,
+)
 from stages.train.timer import TrainingTimer
 from stages.train.visibility_gate import VisibilityGate
 
@@ -53,17 +57,15 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     auxiliary, margin = inputs.get("auxiliary"), context.settings.crop_margin
     data = read_training_data(inputs["ingest"], inputs["fit"], auxiliary, context.body_file, margin)
     plan = read_plan(inputs["plan"] / "plan.json")
-    settings = apply_representation(apply_plan(context.settings, plan))
+    settings = apply_plan(context.settings, plan)
     device = resolve(settings.device)
-    kind = str(product_dtype(device, settings.half_precision)).removeprefix("torch.")
-    log(f"computes on {device}, heads in {kind}")
-    context.timing("device", str(device))
+    log_computing(context, device)
     started = time.monotonic()
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
     trainer = build_trainer(data, settings, device, network, log)
     context.timing("prepare_seconds", time.monotonic() - started)
     log(describe_objective(settings))
-    levels = range(settings.subdivisions + 1)
+    levels = range(len(trainer.avatar.surfaces))
     costs = step_costs(settings, [len(trainer.avatar.surface(level).canonical) for level in levels])
     with context.progress(settings.iterations, "training", costs) as progress:
         curve, timer = add_run_hooks(trainer, context.work, compiled, log)
@@ -74,6 +76,21 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
         context.timing(name, value)
     gate = trainer.hooks.get("gate")
     publish(trainer, curve.curve, gate if isinstance(gate, VisibilityGate) else None, context.output)
+
+
+def log_computing(context: Context, device: torch.device) -> None:
+    """Says where and in which precision training computes, and which settings have no effect."""
+    settings, words = context.settings, f"computes on {device}"
+    context.timing("device", str(device))
+    if settings.representation == "triplane":
+        kind = str(product_dtype(device, settings.half_precision)).removeprefix("torch.")
+        context.timing("precision", kind)
+        words += f", heads in {kind}"
+    context.log(words)
+    ignored = settings_without_effect(settings)
+    if ignored:
+        names = ", ".join(f"train.{name}" for name in ignored)
+        context.log(f"without effect on train.representation={settings.representation}: {names}")
 
 
 def build_trainer(
@@ -87,7 +104,7 @@ def build_trainer(
 
     Args:
         data: to learn from.
-        settings: with plan and representation applied.
+        settings: with the plan applied.
         device: where it computes.
         network: LPIPS, if it has a weight.
         log: for a line on the avatar.

@@ -14,7 +14,6 @@ from pipeline.config.settings import (
     Count,
     CountOrNone,
     Fraction,
-    Iterations,
     LearningRate,
     Seed,
     Weight,
@@ -38,8 +37,25 @@ Threshold = Annotated[float, Field(gt=0, le=1)]
 Rings = Annotated[int, Field(ge=0, le=1000)]
 BasesCount = Annotated[int, Field(ge=0, le=256)]
 Pixels = Annotated[int, Field(ge=0, le=8192)]
+EdgePixels = Annotated[float, Field(ge=0, le=1000)]
+Effort = Annotated[float, Field(gt=0, le=1000)]
 
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
+IGNORED = {
+    "triplane": (
+        "edge_pixels", "bases", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
+        "bases_learning_rate",
+    ),
+    "bases": (
+        "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
+        "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
+        "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
+        "time_frequencies", "time_dropout", "learning_rate", "plane_learning_rate",
+    ),
+}  # fmt: skip
+"""The settings that a representation does not read."""
+
+TRIPLANE_STEPS = 2.0  # times as many as the bases take
 MOST_LEVELS = 2  # of subdivision, that train.subdivisions can ask for
 
 
@@ -51,12 +67,13 @@ class TrainSettings:
     """
 
     seed: Seed = setting(0, "of the initial weights and of every random draw")
-    iterations: Iterations = setting(1000, "optimiser steps")
+    iterations: CountOrNone = setting(0, "optimiser steps; 0: as many as the plan says")
+    effort: Effort = setting(1.0, "times the plan's steps; without effect where iterations is given")
     batch: Batch = setting(1, "frames an optimiser step; they share one decode of the static part")
     half_precision: bool = setting(
         True, "heads in bfloat16 where the processor multiplies it faster (AVX-512, a GPU)"
     )
-    held_out_every: Count = setting(250, "iterations between points of the held-out curve")
+    held_out_every: Count = setting(100, "iterations between points of the held-out curve")
     held_out_frames: CountOrNone = setting(3, "frames of each such point")
     checkpoint_every: Count = setting(250, "iterations between checkpoints")
     # One: bytes do not depend on the number of cores. Two are 1.5 times as fast (docs/log/2026-11.md).
@@ -65,13 +82,18 @@ class TrainSettings:
     # to mean (pipeline/device.py); run.json does.
     device: Device = setting("auto", "where it computes; auto: cuda where there is a GPU and gsplat")
 
-    # Representation; planes, heads, residual colours and noise are the triplane's (apply_representation)
-    representation: Literal["triplane", "bases"] = setting(
-        "triplane", "the paper's triplane and heads, or each Gaussian's own parameters and bases"
+    # Representation; planes, heads, residual colours and noise are the triplane's
+    representation: Literal["bases", "triplane"] = setting(
+        "bases", "each Gaussian's own parameters and bases, or the paper's triplane and heads"
     )
     # A prototype on smile: 35.8, 36.5 and 35.9 dB with 0, 8 and 16; more learn the clip by heart.
     bases: BasesCount = setting(
         8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
+    )
+    edge_pixels: EdgePixels | None = setting(
+        None,
+        "of the bases: edges longer than this in a training frame are split; none: plan.edge_pixels, "
+        "0: subdivisions as given",
     )
     subdivisions: Levels = setting(1, "levels of midpoint subdivision")
     subdivide_from: Fraction = setting(0.5, "fraction of the run before which the mesh stays unsubdivided")
@@ -151,13 +173,14 @@ class TrainSettings:
     # Objective
     l1: Weight = setting(0.8, "lambda_L1")
     ssim: Weight = setting(0.2, "lambda_ssim")
-    lpips: Weight = setting(0.0, "lambda_lpips; the paper's is 0.2")
+    # Bases: a tenth to a quarter less LPIPS for 0.05 dB. The triplane: 0.6 dB on smile (docs/results.md).
+    lpips: Weight = setting(0.05, "lambda_lpips; the paper's is 0.2")
     lpips_network: LpipsNetwork = setting("alex", "its backbone; vgg is twenty times as dear on a CPU")
-    lpips_every: Count = setting(4, "drawn frames for one that LPIPS looks at, with as many times the weight")
+    lpips_every: Count = setting(2, "drawn frames for one that LPIPS looks at, with as many times the weight")
     lpips_crop: Pixels = setting(
         96, "pixels of the square around a random place of the person; 0: the whole view"
     )
-    lpips_from: Fraction = setting(0.0, "fraction of the run from which it takes part")
+    lpips_from: Fraction = setting(0.5, "fraction of the run from which it takes part")
     face: Weight = setting(0.0, "lambda_face; the paper's is 0.8")
     generated_every: Count = setting(5, "draws for one of a generated frame; the paper's is 2, equally often")
     generated: Weight = setting(0.1, "lambda_L1, lambda_ssim and lambda_lpips on generated frames")
@@ -199,11 +222,19 @@ class TrainSettings:
 
 
 def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
-    """The settings with what the plan calls needless switched off; the plan switches nothing on."""
+    """The settings that training really runs with.
+
+    What the plan calls needless is switched off; it switches nothing on. Numbers that are left to it are its.
+    Then come the representation's own (``_for_bases``).
+    """
     needless = {part for part in PLANNED_RESIDUALS if not plan.on(f"{part}_residual")}
     parts = tuple(part for part in settings.residual_parts if part not in needless)
-    return dataclasses.replace(
+    density = plan["gaussians"]
+    edge_pixels = density.threshold if density.on else 0.0
+    applied = dataclasses.replace(
         settings,
+        iterations=settings.iterations or planned_steps(settings, plan),
+        edge_pixels=edge_pixels if settings.edge_pixels is None else settings.edge_pixels,
         residual_parts=parts,
         residual_from=settings.residual_from if parts else 1.0,
         subdivisions=min(settings.subdivisions, subdivision_levels(plan)),
@@ -213,19 +244,25 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
         gate=settings.gate and plan.on("visibility_gate"),
         bases=settings.bases if plan.on("pose_heads") else 0,
     )
+    return _for_bases(applied) if settings.representation == "bases" else applied
 
 
-def apply_representation(settings: TrainSettings) -> TrainSettings:
-    """The settings as the representation needs them; those of the triplane stay as they are.
+def planned_steps(settings: TrainSettings, plan: Plan) -> int:
+    """The optimiser steps that the plan says, times ``effort``; the triplane's network needs more of them."""
+    more = TRIPLANE_STEPS if settings.representation == "triplane" else 1.0
+    return max(1, round(settings.effort * more * plan["steps"].values[0]))
 
-    Bases are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of
+
+def _for_bases(settings: TrainSettings) -> TrainSettings:
+    """The settings as linear bases need them.
+
+    They are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of
     which is only won back. They follow the pose from the first step, too, without noise, and have no residual
     colours.
     """
-    if settings.representation == "triplane":
-        return settings
     return dataclasses.replace(
         settings,
+        subdivisions=0 if settings.edge_pixels else settings.subdivisions,
         subdivide_from=0.0,
         pose_heads_from=0.0 if settings.bases else 1.0,
         pose_seen_only=False,
@@ -233,6 +270,13 @@ def apply_representation(settings: TrainSettings) -> TrainSettings:
         residual_parts=(),
         residual_from=1.0,
     )
+
+
+def settings_without_effect(settings: TrainSettings) -> tuple[str, ...]:
+    """The names of settings that differ from their defaults and that the representation does not read."""
+    usual = TrainSettings()
+    ignored = IGNORED[settings.representation]
+    return tuple(name for name in ignored if getattr(settings, name) != getattr(usual, name))
 
 
 def learning_rates(settings: TrainSettings) -> tuple[str, ...]:

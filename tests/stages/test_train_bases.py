@@ -7,13 +7,16 @@ import torch
 
 from pipeline.avatar import load_avatar
 from pipeline.body import load_body, read_poses, write_poses
-from pipeline.clip.plan import read_plan
 from pipeline.clip.records import Split, write_split
 from pipeline.errors import UserError
 from pipeline.finite import NotFiniteError
 from stages.train import run as stage
 from stages.train.loop import Trainer
-from stages.train.settings import TrainSettings, apply_plan, apply_representation
+from stages.train.settings import (
+    TrainSettings,
+    apply_plan,
+    settings_without_effect,
+)
 from tests.plans import plan_of
 from tests.stages.train_subject import BODY_FILE, context_for, moving_poses, trainer_for, write_subject
 
@@ -86,7 +89,7 @@ def test_more_bases_than_frames_drive_are_as_many_as_they_drive(subject, tmp_pat
     context = context_for(subject, tmp_path, **{**BASES, "bases": 100})
     trainer = trainer_for(context)
     assert 0 < trainer.avatar.architecture.bases <= 4  # five training frames less their mean
-    assert trainer.level == trainer.settings.subdivisions
+    assert trainer.level == len(trainer.avatar.surfaces) - 1  # the finest, from the first step
     trainer.step()
 
 
@@ -129,15 +132,20 @@ def test_fitted_expression_that_is_not_finite_is_refused_with_its_frame(subject,
 
 def test_plan_without_change_of_pose_gives_no_bases():
     settings = TrainSettings(representation="bases")
-    asked = apply_representation(apply_plan(settings, plan_of(pose_heads=False)))
+    asked = apply_plan(settings, plan_of(pose_heads=False))
     assert (asked.bases, asked.pose_heads_from) == (0, 1.0)
-    asked = apply_representation(apply_plan(settings, plan_of()))
+    asked = apply_plan(settings, plan_of())
     assert (asked.bases, asked.pose_heads_from, asked.subdivide_from) == (settings.bases, 0.0, 0.0)
 
 
-def test_triplane_is_left_as_it_was(subject):
-    settings = apply_plan(TrainSettings(), read_plan(subject / "plan" / "plan.json"))
-    assert apply_representation(settings) is settings
+@pytest.mark.parametrize(
+    ("representation", "name", "value"),
+    [("bases", "pose_noise", 0.1), ("bases", "plane_resolution", 64), ("triplane", "bases", 3)],
+)
+def test_settings_that_the_representation_does_not_read_are_named(representation, name, value):
+    settings = TrainSettings(representation=representation, **{name: value}, l1=0.7)
+    assert settings_without_effect(settings) == (name,)
+    assert settings_without_effect(TrainSettings(representation=representation)) == ()
 
 
 def test_rates_far_too_high_are_refused_by_the_rates_that_bases_have(subject, tmp_path):

@@ -22,12 +22,13 @@ from stages.train import objective
 from stages.train.data import TrainingData, read_training_data
 from stages.train.loop import Trainer
 from stages.train.run import build_trainer
-from stages.train.settings import TrainSettings, apply_plan, apply_representation
+from stages.train.settings import TrainSettings, apply_plan
 from tests.plans import plan_of
 
 BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
 FRAMES, WIDTH, HEIGHT = 6, 48, 64
 TINY = TrainSettings(
+    representation="triplane",
     iterations=12,
     held_out_every=6,
     held_out_frames=1,
@@ -42,6 +43,8 @@ TINY = TrainSettings(
     gate_every=2,
     residual_from=0.3,
     face=0.8,
+    lpips=0.0,
+    lpips_from=0.0,
 )
 
 
@@ -125,7 +128,7 @@ def data_for(context) -> TrainingData:
 def trainer_for(context) -> Trainer:
     """A trainer as the stage builds it under a context; hooks that write files are not among its hooks."""
     plan = read_plan(context.inputs["plan"] / "plan.json")
-    settings = apply_representation(apply_plan(context.settings, plan))
+    settings = apply_plan(context.settings, plan)
     return build_trainer(data_for(context), settings)
 
 

@@ -6,13 +6,15 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, load_avatar, pose_features, save_avatar
 from pipeline.avatar.bake import bake
+from pipeline.avatar.canonical import build_canonical
 from pipeline.avatar.representation import Condition
-from pipeline.body import Pose, load_body, mean_identity
+from pipeline.body import Pose, edges, load_body, mean_identity
+from pipeline.body.edge_splits import split_edges
 from pipeline.finite import NotFiniteError
 from tests.conftest import REPOSITORY
 
 K, FRAMES = 3, 8
-KINDS = ("triplane", "bases")
+KINDS = ("triplane", "bases", "split bases")
 
 
 @pytest.fixture(scope="module")
@@ -37,18 +39,27 @@ def conditions() -> ClipConditions:
 
 
 def an_avatar(body, kind: str, awake: bool = True, bases: int = K) -> Avatar:
+    split, kind = kind.startswith("split"), kind.removeprefix("split ")
     sizes = Architecture(
         plane_resolution=8, plane_channels=2, width=8, groups=2, residual_width=8, residual_parts=("face",),
         subdivisions=1, representation=kind, bases=bases if kind == "bases" else 0,
     )  # fmt: skip
     kept = torch.nonzero(body.v_template[:, 1] > 0.32)[:, 0]
-    avatar = Avatar(body, mean_identity(body), kept, sizes, half_precision=False)
+    splits = some_splits(body, kept) if split else ()
+    avatar = Avatar(body, mean_identity(body), kept, sizes, half_precision=False, splits=splits)
     if kind == "triplane" or bases:
         avatar.representation.set_clip(conditions())
     generator = torch.Generator().manual_seed(5)
     for parameter in avatar.parameters() if awake else ():
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=generator)
     return avatar
+
+
+def some_splits(body, kept: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Every third edge, then every fifth of what that makes."""
+    faces = build_canonical(body, mean_identity(body), 0, kept).faces
+    first = edges(faces)[::3]
+    return first, edges(split_edges(faces, first)[0])[::5]
 
 
 @pytest.fixture(params=KINDS)

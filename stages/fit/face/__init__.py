@@ -16,7 +16,6 @@ from pipeline.numba_kernels import threads
 from stages.fit.camera_batch import CameraBatch
 from stages.fit.face.deca import read_flame_parameters
 from stages.fit.face.flame_model import load_flame
-from stages.fit.face.from_flame import face_from_flame
 from stages.fit.face.from_mesh import face_from_mesh
 from stages.fit.face.target import FaceModel, FaceTarget, face_model, sface
 from stages.fit.observations import Observations
@@ -61,6 +60,8 @@ def fit_face(
         model = face_model(body, landmarks.face_mesh)
         if settings.face == "flame":
             parameters = read_flame_parameters(Path(settings.face_init), keypoints.frames)
+            from stages.fit.face.from_flame import face_from_flame  # brings trimesh: a second
+
             target = face_from_flame(model, body, load_flame(Path(settings.flame_model)), parameters)
         else:
             target = _from_mesh(model, keypoints, observations, views)
