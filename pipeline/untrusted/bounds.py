@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import stat
 import warnings
 import zipfile
 from pathlib import Path, PurePosixPath
@@ -51,7 +52,7 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         UserError: the file is missing, cannot be read, or is too large.
     """
     try:
-        size = path.stat().st_size
+        size = regular_size(path, remedy)
         if size > most:
             raise UserError(f"{path} has {size >> 20} MB, more than the {most >> 20} MB allowed: {remedy}")
         with path.open("rb") as file:
@@ -60,6 +61,18 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         raise UserError(f"{path} is missing: {remedy}") from None
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): {remedy}") from None
+
+
+def regular_size(path: Path, remedy: str) -> int:
+    """A file's size in bytes; OSError where it is missing.
+
+    Raises:
+        UserError: a folder, a pipe or a device has that name; to open a pipe would wait for ever.
+    """
+    state = path.stat()
+    if not stat.S_ISREG(state.st_mode):
+        raise UserError(f"{path} is no file but a folder, a pipe or a device: {remedy}")
+    return state.st_size
 
 
 def check_unpacked(archive: zipfile.ZipFile, most_members: int, most_bytes: int) -> None:

@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.untrusted import check_picture
+from pipeline.untrusted import bounded_bytes, check_picture
 from stages.ingest.display_matrix import Orientation
 from stages.ingest.video_file import VideoFile, cut_note, open_video, read_video
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+LARGEST_PICTURE = 1 << 30  # bytes
 SKIP = "ingest.damaged=skip"
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -196,10 +197,8 @@ def _visible_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 
 def read_picture(path: Path) -> np.ndarray:
     """A picture file, [H, W, 3] uint8 RGB, upright after its EXIF flag; UserError if it is damaged."""
-    data, remedy = (
-        np.fromfile(path, np.uint8),
-        f"replace it, take it out of the folder, or leave it out: {SKIP}",
-    )
+    remedy = f"replace it, take it out of the folder, or leave it out: {SKIP}"
+    data = np.frombuffer(bounded_bytes(path, LARGEST_PICTURE, remedy), np.uint8)
     check_picture(path, remedy, data.tobytes())
     image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if image is None:

@@ -47,6 +47,8 @@ class StreamContent:
 
 def open_container(path: Path) -> av.container.InputContainer:
     """The file as FFmpeg's container; UserError where it is none, or has no video stream."""
+    if not path.is_file():
+        raise UserError(f"{path} is no file but a pipe or a device: {VIDEO_REMEDY}")
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError) as error:
