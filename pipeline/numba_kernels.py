@@ -1,10 +1,10 @@
 """The ways to compile a numba kernel, and the number of threads that kernels and torch compute on.
 
-Compiled kernels are kept on disk: in ``__pycache__``, or where NUMBA_CACHE_DIR says, or where neither that nor
-the user's own cache folder can be written, in a folder of the user's among temporary files. That cache
+Compiled kernels are kept on disk: in ``__pycache__``, or where NUMBA_CACHE_DIR says, or where neither that
+nor the user's own cache folder can be written, in a folder of the user's among temporary files. That cache
 watches a kernel's own file and nothing else, so a kernel calls only kernels of its own file, and numbers from
-elsewhere reach it as arguments. Where that cannot be (the flags below, ``tiles.TILE``), delete ``__pycache__``
-after a change.
+elsewhere reach it as arguments. Where that cannot be (the flags below, ``tiles.TILE``), delete
+``__pycache__`` after a change.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from stages.fit.settings import FitSettings
 
 STAGE = Stage(
     name="fit",
-    version=7,
+    version=8,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={
