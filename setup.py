@@ -1,7 +1,7 @@
 """What goes into the wheel: the command, and beneath it the checkout's packages and definitions.
 
-``pipeline`` and ``stages`` become ``flexiavatar/checkout/pipeline`` and ``flexiavatar/checkout/stages``: names
-as common as theirs would stand in the way of others in an environment. The command puts that folder on the path.
+``pipeline`` and ``stages`` become ``flexiavatar/checkout/pipeline`` and ``flexiavatar/checkout/stages``: such
+common names would stand in the way of others in an environment. The command puts that folder on the path.
 """
 
 from setuptools import find_packages, setup
