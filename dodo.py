@@ -33,6 +33,7 @@ from pipeline.config.request import Request, parse_request
 from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.doit_reporter import summarising
+from pipeline.run.effect import check_effect, named_tasks
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
@@ -58,7 +59,8 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
     """
     os.chdir(get_initial_workdir())  # relative paths are meant from where the user stands, also with doit -f
     try:
-        request = parse_request(word for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
+        words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        request = parse_request(words)
         check_settings(request)
         chosen = chosen_subjects(request)
         if request.source and len(chosen) > 1:
@@ -66,12 +68,17 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
         for subject in sorted({*request.subjects, *named_subjects(request)} - kept_subjects(request)):
             about = request.about(subject)
             load_subject(request.workspace, subject, about.source, about.dataset)
+        stages = load_stages(request.workspace.stages)
+        tasks = named_tasks(sys.argv[1:], stages)
+        if tasks is not None:
+            names = [word.partition("=")[0] for word in words]
+            check_effect(request, names, tasks, chosen, stages)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return request, chosen
 
 
-def named_tasks() -> list[tuple[str, str]]:
+def task_words() -> list[tuple[str, str]]:
     """The tasks that the command line names: ``fit:oliver`` is ("fit", "oliver")."""
     words = [word.partition(":") for word in sys.argv[1:] if "=" not in word and not word.startswith("-")]
     return [(kind, subject) for kind, _, subject in words]
@@ -80,7 +87,7 @@ def named_tasks() -> list[tuple[str, str]]:
 def named_subjects(request: Request) -> set[str]:
     """The subjects of the tasks that the command line names."""
     kinds = {*load_stages(request.workspace.stages), *CARE}
-    return {subject for kind, subject in named_tasks() if kind in kinds and subject and "*" not in subject}
+    return {subject for kind, subject in task_words() if kind in kinds and subject and "*" not in subject}
 
 
 def stored_subjects(request: Request) -> tuple[str, ...]:
@@ -90,7 +97,7 @@ def stored_subjects(request: Request) -> tuple[str, ...]:
 
 def kept_subjects(request: Request) -> set[str]:
     """Those of whom only stored results are asked for: to check and delete these no footage is needed."""
-    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in named_tasks())
+    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in task_words())
     return set(stored_subjects(request)) if cares else set()
 
 

@@ -8,6 +8,9 @@ differs is the model's own arithmetic, and Adam's.
 
 "ours" asks the pose heads only for the Gaussians that the frame shows, as training does under
 ``train.pose_seen_only``; the others would get no gradient from it. "ours, all" asks them for every Gaussian.
+
+"bases" is the other representation, as many Gaussians with parameters and linear bases of their own, posed
+in one pass; "bases, step by step" is its plain twin. They are compared with each other.
 """
 
 from __future__ import annotations
@@ -21,10 +24,19 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks import frame
-from benchmarks.avatars import add_sizes, avatar_camera, avatar_of, chosen_case, poses_of, sizes_of
+from benchmarks.avatars import (
+    add_sizes,
+    avatar_camera,
+    avatar_of,
+    bases_avatar_of,
+    chosen_case,
+    poses_of,
+    sizes_of,
+)
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.body import Pose
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over
@@ -37,13 +49,14 @@ REST = "pose, skin"
 PARTS = ("triplane", "static heads", "pose heads", REST, "render", "losses", "regularisers", "Adam")
 STILL = 1e-9  # learning rate: every repetition does the same work
 OURS, ALL, OURS_SINGLE, PLAIN = "ours", "ours, all", "ours float32", "straightforward"
+BASES, TWIN = "bases", "bases, step by step"
 
 
 def measure(options: argparse.Namespace, report: frame.Report) -> str:
     """Compares and times every case."""
     counts, sizes, repeats = sizes_of(options, repeats=7)
     for count in counts:
-        contestants = contestants_of(count, options.clock)
+        contestants, bases = contestants_of(count, options.clock), bases_of(count, options.clock)
         for size in sizes:
             avatar = contestants[0].model
             assert isinstance(avatar, Avatar)
@@ -52,14 +65,19 @@ def measure(options: argparse.Namespace, report: frame.Report) -> str:
                 image, gradient = difference(one, contestants[-1], frames)
                 row = {"gaussians": len(avatar), "size": size, "contestant": one.name}
                 report.add(row | {"image": image, "gradients": gradient}, f"apart from {PLAIN}")
-            for row in race(contestants, frames, repeats):
+            image, gradient = bases_difference(*bases, frames)
+            row = {"gaussians": len(avatar), "size": size, "contestant": BASES}
+            report.add(row | {"image": image, "gradients": gradient}, f"apart from {TWIN}")
+            for row in race([*contestants, *bases], frames, repeats):
                 report.add({"gaussians": len(avatar), "size": size, **row})
     count, size, case = chosen_case(report.tables["rows"])
     fastest = {row["contestant"]: row["step_ms"] for row in case}
     ratio, whole, single = (fastest[PLAIN] / fastest[name] for name in (OURS, ALL, OURS_SINGLE))
+    triplane, twin = (fastest[name] / fastest[BASES] for name in (OURS, TWIN))
     return (
         f"{count} Gaussians at {size}²: {fastest[OURS]:.1f} ms; {PLAIN} takes {ratio:.2f} times ours "
-        f"({whole:.2f} where every Gaussian is posed, {single:.2f} of these in float32)"
+        f"({whole:.2f} where every Gaussian is posed, {single:.2f} of these in float32); bases "
+        f"{fastest[BASES]:.1f} ms: ours takes {triplane:.2f} times that, bases step by step {twin:.2f} times"
     )
 
 
@@ -113,9 +131,10 @@ class Contestant:
         self.name, self.model, self.optimizer, self.shared, self.seen = name, model, optimizer, shared, seen
         self.clock = PartClock(REST, frame.CLOCKS[clock])
         networks = model.representation if isinstance(model, Avatar) else model
-        self.clock.watch("triplane", networks.triplane)
-        self.clock.watch("static heads", networks.geometry, networks.color)
-        self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
+        if not isinstance(networks, BasesRepresentation):
+            self.clock.watch("triplane", networks.triplane)
+            self.clock.watch("static heads", networks.geometry, networks.color)
+            self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
         self._render = self.clock.timed("render", render)
         self._compare = self.clock.timed("losses", photometric)
         self._regularise = self.clock.timed("regularisers", regularisers)
@@ -202,6 +221,28 @@ def contestants_of(count: int, clock: str) -> list[Contestant]:
         Contestant(OURS_SINGLE, single, adam(single, fused=True), shared=True, clock=clock),
         Contestant(PLAIN, plain, adam(plain, fused=False), shared=False, clock=clock),
     ]
+
+
+def bases_of(count: int, clock: str) -> tuple[Contestant, Contestant]:
+    """Linear bases in one pass and step by step, from the same weights."""
+    fused, plain = bases_avatar_of(count), bases_avatar_of(count)
+    plain.at_once = False
+    both = ((BASES, fused), (TWIN, plain))
+    made = [Contestant(name, one, adam(one, fused=True), shared=True, clock=clock) for name, one in both]
+    return made[0], made[1]
+
+
+def bases_difference(fused: Contestant, plain: Contestant, frames: list[Frame]) -> tuple[float, float]:
+    """As ``difference``, of two avatars of bases."""
+    images, gradients = [], []
+    for one in (fused, plain):
+        one.objective(frames).backward()
+        gradients.append([parameter.grad for parameter in one.model.parameters()])
+        one.model.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            images.append(render(one.pose(one.model.decode(), frames[0]).gaussians, frames[0].camera).color)
+    apart = [float((mine - theirs).norm() / theirs.norm()) for mine, theirs in zip(*gradients, strict=True)]
+    return float((images[0] - images[1]).abs().mean()), max(apart)
 
 
 def adam(model: nn.Module, fused: bool) -> torch.optim.Adam:

@@ -113,7 +113,8 @@ def parse_request(words: Iterable[str] | Mapping[str, str], subject: str = "") -
         subject: who it is about, in place of ``subject=``.
 
     Raises:
-        UserError: a word is not of the form NAME=VALUE, unknown (the near names are shown), empty or wrong.
+        UserError: a word is not of the form NAME=VALUE, unknown (the near names are shown), there twice,
+            empty or wrong.
     """
     pairs = dict(words) if isinstance(words, Mapping) else _pairs(words)
     pairs |= {"subject": subject} if subject else {}
@@ -141,6 +142,8 @@ def _pairs(words: Iterable[str]) -> dict[str, str]:
         name, equals, value = word.partition("=")
         if not equals:
             raise UserError(f"'{word}' is not of the form NAME=VALUE")
+        if name in pairs:
+            raise UserError(f"{ORIGIN}: {name}= stands twice, {pairs[name]} and {value}: leave one out")
         pairs[name] = value
     return pairs
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config.choices import UpAxis
+from pipeline.config.choices import PlyUp
 from pipeline.splat.gaussians import Gaussians
 
 SH_0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
@@ -37,7 +37,7 @@ _HALF = np.sqrt(0.5)
 _TURNS = {"y": (1.0, 0.0), "-y": (0.0, 1.0), "z": (_HALF, _HALF)}
 
 
-def write_ply(path: Path, gaussians: Gaussians, up: UpAxis = "y") -> None:
+def write_ply(path: Path, gaussians: Gaussians, up: PlyUp = "y") -> None:
     """Write Gaussians; those with a number that is not finite, or without orientation, are left out.
 
     Opacities are clamped to [1e-6, 1 - 1e-6], scales to 1e-9 m and more; quaternions are normalised.

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.config.choices import UpAxis
+from pipeline.config.choices import PlyUp, Up
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
 from stages.animate.motions.source import TURNTABLE, motion_source
@@ -61,10 +61,10 @@ class AnimateSettings:
         "where the clip showed nothing: nothing, base (the fitted body in the colours next to it), "
         "auto: as it was trained (train.unseen)",
     )
-    up: Literal["auto", "y", "z"] = setting(
-        "auto", "the axis that is up in an .npz; auto: the one along which its body stands"
+    up: Up = setting(
+        "auto", "the axis that is up in a .bvh or an .npz; auto: the one along which its body stands"
     )
-    ply_up: UpAxis = setting(
+    ply_up: PlyUp = setting(
         "y", "the axis that points up in ply/: y as in cameras.parquet; most viewers show -y upright"
     )
     background: ColorName | HexColor = setting(

@@ -12,6 +12,7 @@ STAGE = Stage(
         "ingest": (
             "frames/*",
             "masks/*",
+            "foreground/*",
             "cameras.parquet",
             "keypoints.parquet",
             "split.json",

@@ -27,6 +27,7 @@ LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 """The layouts of ``stages/ingest/datasets``, in the order in which a folder is tried."""
 
 TestFraction = Annotated[float, Field(ge=0, le=0.9)]
+FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
 Focal = Annotated[float, Field(ge=0.1, le=100)]
 UnitScale = Annotated[float, Field(ge=0, le=1e6)]
 EstimatorSide = Annotated[int, Field(ge=128, le=8192)]
@@ -49,6 +50,9 @@ class IngestSettings:
     )
     masks: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of grey pictures, white where the person is"
+    )
+    numbered_from: FirstNumber = setting(
+        -1, "the first frame's number in the names of files that are not named as the frames; -1: as they say"
     )
     poses: str = setting("", "file of poses to start from that lies elsewhere than the footage: SHOW's .pkl")
     test_fraction: TestFraction = setting(
@@ -109,6 +113,11 @@ class IngestSettings:
         if self.mannequin:
             check_motion(self.mannequin_motion)
         return self
+
+    @property
+    def first_number(self) -> int | None:
+        """The first frame's number in the names of given files; None where the names say."""
+        return None if self.numbered_from < 0 else self.numbered_from
 
     @property
     def uses_estimator(self) -> bool:

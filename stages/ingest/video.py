@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
 
+from pipeline.clip.frame_files import ClipFrames, visible_files
 from pipeline.errors import UserError
-from pipeline.untrusted import bounded_bytes, check_picture
+from pipeline.untrusted import GIGABYTE, bounded_bytes, check_picture
 from stages.ingest.display_matrix import Orientation
 from stages.ingest.video_file import VideoFile, cut_note, open_video, read_video
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
-LARGEST_PICTURE = 1 << 30  # bytes
 SKIP = "ingest.damaged=skip"
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -136,12 +135,20 @@ def _read_video(clip: Clip, stride: int) -> Iterator[SourceFrame]:
 
 
 def _open_folder(path: Path) -> Clip:
-    files = _visible_files(path, PICTURES)
+    files = visible_files(path, PICTURES)
     if not files:
         raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): give a folder of frames")
-    # A frame's number is its whole name, or else the place in the order of names.
-    by_name = {int(file.stem): file for file in files if file.stem.isdecimal()}
-    pictures = by_name if len(by_name) == len(files) else dict(enumerate(files))
+    # A frame's number is its whole name, or else the place in the natural order of names.
+    stems = [file.stem for file in files]
+    numbered = all(stem.isascii() and stem.isdigit() for stem in stems)
+    pictures: dict[int, Path] = {}
+    names: dict[str | int, Path] = {}
+    for place, file in enumerate(files):
+        name = int(file.stem) if numbered else file.stem
+        if name in names:
+            raise UserError(f"{file} and {names[name].name} have one name: keep one of them")
+        names[name] = file
+        pictures[int(name) if numbered else place] = file
     return folder_clip(path, pictures)
 
 
@@ -158,47 +165,17 @@ def folder_clip(path: Path, pictures: Mapping[int, Path], fps: float = 0.0) -> C
     return Clip(path, width, height, fps, len(ordered), ordered)
 
 
-def last_number(name: str) -> int | None:
-    """The last run of digits in a name; what precedes it is a camera, a take or a word."""
-    digits = re.findall(r"\d+", name)
-    return int(digits[-1]) if digits else None
-
-
-def trailing_number(name: str) -> int | None:
-    """The digits that a name ends with."""
-    match = re.search(r"\d+\Z", name)
-    return int(match.group()) if match else None
-
-
-def numbered_files(
-    folder: Path,
-    suffixes: Sequence[str] = PICTURES,
-    number_of: Callable[[str], int | None] = last_number,
-) -> dict[int, Path]:
-    """Frame number -> file, sorted; names without a number are left out. Empty without such a folder.
-
-    Raises:
-        UserError: two files of one frame.
-    """
-    found: dict[int, Path] = {}
-    for file in _visible_files(folder, suffixes) if folder.is_dir() else []:
-        number = number_of(file.stem)
-        if number in found:
-            raise UserError(f"{file} and {found[number].name} both name frame {number}: keep one")
-        if number is not None:
-            found[number] = file
-    return dict(sorted(found.items()))
-
-
-def _visible_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    files = sorted(folder.iterdir())
-    return [file for file in files if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+def clip_frames(clip: Clip) -> ClipFrames:
+    """The frames of a clip, and what they are called where they are pictures."""
+    if clip.pictures:
+        return ClipFrames(tuple(clip.pictures), {frame: file.name for frame, file in clip.pictures.items()})
+    return ClipFrames(range(clip.first, clip.first + clip.expected))
 
 
 def read_picture(path: Path) -> np.ndarray:
     """A picture file, [H, W, 3] uint8 RGB, upright after its EXIF flag; UserError if it is damaged."""
     remedy = f"replace it, take it out of the folder, or leave it out: {SKIP}"
-    data = np.frombuffer(bounded_bytes(path, LARGEST_PICTURE, remedy), np.uint8)
+    data = np.frombuffer(bounded_bytes(path, GIGABYTE, remedy), np.uint8)
     check_picture(path, remedy, data.tobytes())
     image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if image is None:

@@ -15,23 +15,29 @@ from stages.ingest.cameras.distortion import distortion_pixels, undistort_frames
 from stages.ingest.mask_smoothing import smooth_masks
 from stages.ingest.masks import fill_holes, follow_edges, fuse, main_component, overlap, selfie_share
 from stages.ingest.run import run
-from tests.stages.ingest_clips import body_points, make_context, walking_blob, write_images
+from tests.made.videos import body_points, ingest_context, walking_blob, write_images
 
 
 def material(folder, frames, masks, points=None):
-    """A folder of pictures, with masks and keypoints beside it."""
+    """A folder of pictures, with masks and keypoints beside it, which lie on the person."""
     write_images(folder / "clip", frames)
     write_images(folder / "masks", masks)
     (folder / "keypoints").mkdir()
     for number in range(len(frames)):
-        value = points(number) if points else body_points(frames[0].shape[1] / 2, frames[0].shape[0] / 2)
+        value = points(number) if points else body_points(*middle_of(masks[number]))
         (folder / "keypoints" / f"{number}.json").write_text(json.dumps(value))
     return folder
 
 
+def middle_of(mask):
+    """The middle of a mask, or of its picture where it is empty, less half of what the points extend."""
+    rows, columns = np.nonzero(mask if mask.any() else mask == 0)
+    return columns.mean() - 3, rows.mean() - 2
+
+
 def ingest(folder, **settings):
     given = {"keypoints": str(folder / "keypoints"), "masks": str(folder / "masks"), **settings}
-    context = make_context(folder / "run", folder / "clip", **given)
+    context = ingest_context(folder / "run", folder / "clip", **given)
     run(context)
     return context.output
 

@@ -18,7 +18,7 @@ from pipeline.clip.keypoints import empty_keypoints, read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, write_cameras
 from pipeline.errors import UserError
 from stages.ingest.cameras.background_motion import MOVING
-from stages.ingest.cameras.calibration import CalibratedCamera, frames_by_name, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, frames_of_views, pinhole_lens
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.cameras.distortion import (
     distortion_pixels,
@@ -31,11 +31,11 @@ from stages.ingest.cameras.extrinsics import FACING, interpolate_gaps, to_uprigh
 from stages.ingest.display_matrix import Orientation
 from stages.ingest.run import run
 from stages.ingest.video import Clip
-from tests.stages.camera_scene import (
+from tests.made.room import (
     centres_in_first,
     rotation_error,
 )
-from tests.stages.ingest_clips import make_context, walking_blob, write_clip, write_images, write_points
+from tests.made.videos import ingest_context, walking_blob, write_clip, write_images, write_points
 
 COUNT = 8
 SIZE = (128, 96)
@@ -53,7 +53,7 @@ def material(tmp_path: Path) -> Path:
 
 def ingest(material: Path, name: str = "run", **settings: object) -> Path:
     given = {"keypoints": str(material / "keypoints"), "masks": str(material / "masks"), **settings}
-    context = make_context(material / name, material / "clip.mp4", **given)
+    context = ingest_context(material / name, material / "clip.mp4", **given)
     run(context)
     return context.output
 
@@ -334,17 +334,23 @@ def test_a_distorted_model_changes_what_is_published(
 # Numbering, gaps, world
 
 
+def matched(names: list[str], clip: Clip, total: int, path: Path) -> dict[str, int]:
+    view = CalibratedCamera(pinhole_lens(4, 4, (4.0, 4.0), (2.0, 2.0)), np.eye(3), np.zeros(3))
+    given = Calibration(path, "COLMAP", dict.fromkeys(names, view), metric=False, upright=False)
+    return frames_of_views(given, clip, total)[0]
+
+
 def test_names_of_pictures_in_a_folder_win(tmp_path: Path) -> None:
     clip = clip_of(tmp_path, pictures={0: Path("a12.png"), 1: Path("a13.png")})
-    assert frames_by_name(["a13.jpg", "a12.jpg"], clip, 2, tmp_path) == ({"a13.jpg": 1, "a12.jpg": 0}, 0)
+    assert matched(["a13.jpg", "a12.jpg"], clip, 2, tmp_path) == {"a13.jpg": 1, "a12.jpg": 0}
 
 
 def test_numbers_are_believed_where_nobody_knows_the_length(tmp_path: Path) -> None:
-    assert frames_by_name(["x/90.png"], clip_of(), 0, tmp_path) == ({"x/90.png": 90}, 0)
+    assert matched(["x/90.png"], clip_of(), 0, tmp_path) == {"x/90.png": 90}
     with pytest.raises(UserError, match="both name frame 4"):
-        frames_by_name(["a4.png", "b4.png"], clip_of(), 8, tmp_path)
+        matched(["a4.png", "b4.png"], clip_of(), 8, tmp_path)
     with pytest.raises(UserError, match="no frame number"):
-        frames_by_name(["front.png"], clip_of(), 8, tmp_path)
+        matched(["front.png"], clip_of(), 8, tmp_path)
 
 
 def test_short_gaps_are_filled_and_long_ones_are_not() -> None:

@@ -14,7 +14,7 @@ from pipeline.body import joint_index, posed_joints
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.pose_files import into_camera, into_world, moved_pivot, read_hand_mean, read_smplx_json
-from tests.unit.fake_body import PARENTS, write_official
+from tests.made.fake_body import PARENTS, write_official
 
 FLAT = torch.zeros(30, 3)
 FAST = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -207,7 +207,7 @@ def test_two_files_of_a_frame_and_lengths_that_differ_are_errors(tmp_path):
     with pytest.raises(UserError, match=r"2\.json has 50 numbers in expr, 1\.json 10"):
         read_smplx_json(folder, [1, 2], FLAT)
     write(folder, {"01": parameters()})
-    with pytest.raises(UserError, match=r"of one frame"):
+    with pytest.raises(UserError, match=r"both name frame 1: keep one"):
         read_smplx_json(folder, [1], FLAT)
 
 
