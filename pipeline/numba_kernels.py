@@ -82,7 +82,7 @@ exact_kernel: _Decorator = numba.njit(cache=_KEPT)
 def threads(count: int) -> Iterator[None]:
     """Within this, torch and the kernels compute on ``count`` threads; 0 leaves them as they are.
 
-    With one thread equal input gives equal bytes on any number of cores, gradients of indexing included. At
+    With one thread equal input gives equal bytes on any number of cores of one kind, gradients too. At
     the sizes of a quick run two are 1.5 times as fast on two cores (docs/log/2026-11.md).
     """
     # numba's pool sets OpenMP's number of threads, which is torch's too, when it starts: so start it first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 
@@ -235,6 +236,22 @@ def test_a_damaged_picture_of_a_folder_is_refused_or_left_out(tmp_path: Path) ->
         list(read_clip(open_clip(folder)))
     frames = read_clip(open_clip(folder), damaged="skip")
     assert [(frame.index, frame.damaged) for frame in frames] == [(0, False), (1, True), (2, False)]
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "dangling link"])
+def test_what_is_no_file_among_frames_is_refused_or_left_out(tmp_path: Path, kind: str) -> None:
+    folder = write_images(tmp_path / "frames", numbered_images(3))
+    odd = folder / "0003.png"
+    {"folder": odd.mkdir, "pipe": lambda: os.mkfifo(odd), "dangling link": lambda: odd.symlink_to("nothing")}[
+        kind
+    ]()
+    with pytest.raises(UserError, match=r"0003\.png"):
+        list(read_clip(open_clip(folder)))
+    assert [frame.index for frame in read_clip(open_clip(folder), damaged="skip") if not frame.damaged] == [
+        0,
+        1,
+        2,
+    ]
 
 
 def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
