@@ -11,7 +11,6 @@ Without a GPU it says so and ends with status 1. Footage and weights are fetched
 from __future__ import annotations
 
 import argparse
-import copy
 import dataclasses
 import importlib.util
 import itertools
@@ -172,7 +171,7 @@ def fitted_mannequin(words: Mapping[str, str], representation: str) -> tuple[Tra
 
 def compare(data: TrainingData, settings: TrainSettings, device: torch.device, steps: int) -> dict[str, Any]:
     """A row: how far the devices are apart in pictures, gradients and what steps make of the weights."""
-    cpu, gpu = trainers(data, settings, device)
+    cpu, gpu = (trainer_on(place, data, settings) for place in (torch.device("cpu"), device))
     pictures = [apart(*pair) for pair in zip(pictures_of(cpu), pictures_of(gpu), strict=True)]
     for one in (cpu, gpu):
         one.step()
@@ -192,18 +191,14 @@ def compare(data: TrainingData, settings: TrainSettings, device: torch.device, s
     return {**row, "agree": all(abs(row[name]) <= limit for name, limit in LIMITS.items())}
 
 
-def trainers(data: TrainingData, settings: TrainSettings, device: torch.device) -> tuple[Trainer, Trainer]:
-    """Trainers of the same weights on the CPU and on another device."""
-    initial, data = initial_avatar(data, PoseRefinement(data.poses, data.clip.split.train), settings)
+def trainer_on(place: torch.device, data: TrainingData, settings: TrainSettings) -> Trainer:
+    """A trainer on a device; its weights are made on the CPU, always alike."""
+    train = data.clip.split.train
+    avatar, data = initial_avatar(data, PoseRefinement(data.poses, train), settings)
     generator = torch.Generator().manual_seed(5)
-    for _, parameter in sorted(initial.named_parameters()):
+    for _, parameter in sorted(avatar.named_parameters()):
         parameter.data += AWAKE * torch.randn(parameter.shape, generator=generator)
-
-    def trainer(place: torch.device) -> Trainer:
-        refinement = PoseRefinement(moved(data.poses, place), data.clip.split.train)
-        return Trainer(copy.deepcopy(initial).to(place), refinement, data, settings)
-
-    return trainer(torch.device("cpu")), trainer(device)
+    return Trainer(avatar.to(place), PoseRefinement(moved(data.poses, place), train), data, settings)
 
 
 @torch.no_grad()

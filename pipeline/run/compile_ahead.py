@@ -128,14 +128,14 @@ def main(functions: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # whoever stops the job wants no traceback of this
     if hasattr(os, "nice"):
         os.nice(LOWEST_PRIORITY)
-    from pipeline.run.compile_timer import compile_timer  # numba, after the priority
-
     with contextlib.ExitStack() as stack:
         try:
             cache_folder().mkdir(parents=True, exist_ok=True)
             stack.enter_context(filelock.FileLock(cache_folder() / LOCK).acquire(timeout=0))
         except (OSError, filelock.Timeout):  # of a read-only installation, or held
             return 0
+        from pipeline.run.compile_timer import compile_timer  # numba, for whoever has work
+
         compiled = stack.enter_context(compile_timer(say))
         for function in functions:
             try:
