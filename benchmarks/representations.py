@@ -26,7 +26,7 @@ from stages.evaluate.methods import AVATAR, NEAREST
 
 SUBJECTS = ("smile", "carphone", "oliver", "balance", "mannequin_head", "mannequin_upper", "mannequin_full")
 VARIANTS: Mapping[str, Mapping[str, str]] = {
-    "triplane": {"train.representation": "triplane"},
+    "triplane": {"train.representation": "triplane", "train.lpips": "0"},
     "bases": {},
     "draft": {"preset": "draft"},
     "balanced": {"preset": "balanced"},

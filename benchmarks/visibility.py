@@ -118,8 +118,8 @@ def compare(subject: Subject, options: argparse.Namespace, network: Lpips) -> li
     trainers, rows = {}, []
     for name in options.variants.split(","):
         settings = dataclasses.replace(
-            TrainSettings(), iterations=iterations, subdivisions=options.subdivisions,
-            subdivide_from=0.0, checkpoint_every=10**6, **VARIANTS[name],
+            TrainSettings(representation="triplane", lpips=0.0), iterations=iterations,
+            subdivisions=options.subdivisions, subdivide_from=0.0, checkpoint_every=10**6, **VARIANTS[name],
         )  # fmt: skip
         trainer = build_trainer(subject.data, apply_plan(settings, subject.plan))
         while trainer.iteration < iterations:

@@ -6,8 +6,9 @@ generated views too, which the quick preset leaves out. What two variants share 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import json
+import functools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -20,14 +21,14 @@ from pipeline.config.request import Request
 from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
 from pipeline.run.progress import Progress
-from pipeline.store.artifact import MANIFEST
-from pipeline.studies.measure import AvatarMeter
+from pipeline.store.artifact import read_manifest
+from pipeline.studies.measure import AvatarMeter, Numbers, score_table
 from pipeline.studies.plots import bars
-from pipeline.studies.report import Page, Section, publish, settings_section, sizes_of, timings_section
+from pipeline.studies.report import Page, Section, closing_sections, publish, sizes_of, study_folder
 from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, REGIONS, RUNTIME, Table
-from pipeline.studies.variants import Base, Result, Variant, base_of, scale_overrides, study_folder
+from pipeline.studies.variants import Base, Result, Variant, another_seed, base_of, scale_overrides
 
-FULL, CHANCE, CHANCE_LABEL = "full", "chance", "another seed"
+FULL, CHANCE = "full", "chance"
 FIXED = 0.4  # the paper's threshold by hand
 
 VARIANTS: Mapping[str, Variant] = {
@@ -43,7 +44,7 @@ VARIANTS: Mapping[str, Variant] = {
 }
 """Key -> variant, in the paper's order; another seed comes last."""
 
-LABELS = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: CHANCE_LABEL}
+LABELS = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: "another seed"}
 
 COLUMNS: Mapping[str, Sequence[str]] = {"runtime": list(RUNTIME), "regions": list(REGIONS)}
 CAPTIONS = {
@@ -66,15 +67,22 @@ class Ablation:
 
     Attributes:
         results: (subject, key of the variant) -> result.
-        scores: a row a result, indexed likewise; a column a metric or a number of the runtime.
+        speeds: as ``AvatarMeter.speeds`` gives them.
         dataset: the one that all subjects belong to; empty if none.
         refined: whether the scores are those with held-out poses refined, as on NeuMan.
     """
 
     results: Mapping[tuple[str, str], Result]
-    scores: pd.DataFrame
+    speeds: Mapping[Path, Numbers]
     dataset: str = ""
     refined: bool = False
+
+    @functools.cached_property
+    def scores(self) -> pd.DataFrame:
+        """A row a result, indexed like the results; columns as in ``score_table``."""
+        method = "avatar_refined" if self.refined else "avatar"
+        index = pd.MultiIndex.from_tuples(list(self.results), names=["subject", "variant"])
+        return score_table(list(self.results.values()), self.speeds, method).set_axis(index)
 
     @property
     def subjects(self) -> list[str]:
@@ -107,12 +115,13 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
         UserError: a setting is wrong, or nothing at all could be made.
     """
     scale_overrides(request)  # refused before anything is made
-    start, folder = time.monotonic(), study_folder(request, "ablate", name)
+    start, folder = time.monotonic(), study_folder(request.workspace.data, "ablate", name)
     bases, results = run_all(subjects, request, folder / "log.txt")
     if all(result.failure for result in results.values()):
         raise UserError(next(iter(results.values())).failure)
     refined = all(counts_refined(base) for base in bases.values())
-    ablation = Ablation(results, scores_of(bases, results, refined), dataset_of(subjects, request), refined)
+    speeds = speeds_of(bases, results)
+    ablation = Ablation(results, speeds, dataset_of(subjects, request), refined)
     write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
     return folder
 
@@ -123,28 +132,34 @@ def run_all(
     """Every variant of every subject, a subject after the other; and the bases that could be read."""
     bases: dict[str, Base] = {}
     results: dict[tuple[str, str], Result] = {}
-    progress = Progress(len(subjects) * (len(VARIANTS) + 1), "ablate")
-    try:
+    with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
                 bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
             except UserError as error:
-                results |= {(subject, key): Result(subject, key, str(error)) for key in (*VARIANTS, CHANCE)}
-                progress.advance(len(VARIANTS) + 1, subject)
+                results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
+                progress.advance(len(LABELS), subject)
                 continue
             for key, variant in variants_of(bases[subject]).items():
                 results[subject, key] = bases[subject].run(variant)
                 print(results[subject, key].line, flush=True)
                 progress.advance(1, variant.name)
-    finally:
-        progress.close()
     return bases, results
+
+
+def speeds_of(bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result]) -> dict[Path, Numbers]:
+    """The numbers of ``AvatarMeter.speeds`` of all results; each subject's avatars are timed together."""
+    speeds: dict[Path, Numbers] = {}
+    for subject, base in bases.items():
+        done = [one for one in results.values() if one.subject == subject and not one.failure]
+        if done:
+            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
+    return speeds
 
 
 def variants_of(base: Base) -> dict[str, Variant]:
     """The variants in the paper's order, and another seed."""
-    seed = base.settings["train"].seed + 1
-    return {**VARIANTS, CHANCE: Variant(CHANCE_LABEL, {"train.seed": str(seed)})}
+    return {**VARIANTS, CHANCE: another_seed(base.settings)}
 
 
 def dataset_of(subjects: Sequence[str], request: Request) -> str:
@@ -160,118 +175,72 @@ def counts_refined(base: Base) -> bool:
     return evaluate.refine_test_poses == "on" or getattr(evaluate, "protocol", "") == "paper"
 
 
-def scores_of(
-    bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result], refined: bool
-) -> pd.DataFrame:
-    """Every result's scores of held-out frames and what a frame of its avatar costs; see ``Ablation``."""
-    speeds: dict[str, Mapping[str, float]] = {}
-    for subject, base in bases.items():
-        done = [one for one in results.values() if one.subject == subject and not one.failure]
-        if done:
-            print(f"{subject}: timing {len(done)} avatars in motion", flush=True)
-            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
-    return score_table(results, speeds, refined)
-
-
-def score_table(
-    results: Mapping[tuple[str, str], Result], speeds: Mapping[str, Mapping[str, float]], refined: bool
-) -> pd.DataFrame:
-    """Scores and runtime of results, indexed by subject and variant; NaN where there is none.
-
-    Args:
-        results: as ``Ablation`` has them.
-        speeds: name of the train version -> numbers of ``AvatarMeter.speeds``.
-        refined: whether scores are those with held-out poses refined.
-    """
-    rows = [
-        {}
-        if one.failure
-        else one.held_out("avatar_refined" if refined else "avatar") | dict(speeds[one.folders["train"].name])
-        for one in results.values()
-    ]
-    index = pd.MultiIndex.from_tuples(list(results), names=["subject", "variant"])
-    scores = pd.DataFrame(rows, index).reindex(columns=[*IMAGE, *RUNTIME, *REGIONS]).astype(float)
-    scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
-    scores["fps"] = 1e3 / scores["total_ms"]
-    return scores
-
-
 def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
     """The paper's tables with what was measured here; those of which nothing was measured are left out.
 
-    Args:
-        ablation: its results.
-        sizes: a sentence on the sizes, for the captions.
+    ``sizes`` stand in the captions, see ``sizes_of``.
     """
     noise = ablation.gains("psnr")[CHANCE]
-    sizes += f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
+    chance = f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
     described = [*read_toml(Path(__file__).with_name("paper.toml"))["tables"], CHANCE_TABLE]
     return [
-        table_of(about, ablation, sizes)
+        table_of(about, ablation, f"Sizes: {sizes}.{chance}")
         for about in described
         if ablation.scores[COLUMNS.get(about.get("kind", ""), list(IMAGE))].notna().any(axis=None)
     ]
 
 
-def table_of(about: Mapping[str, Any], ablation: Ablation, sizes: str) -> Table:
+def table_of(about: Mapping[str, Any], ablation: Ablation, remark: str) -> Table:
     """One of the paper's tables; its own figures stand beside ours where they are of the same footage.
 
     Args:
         about: the table as paper.toml describes it.
         ablation: its results.
-        sizes: a sentence for the caption.
+        remark: ends the caption.
     """
-    keys = COLUMNS.get(about.get("kind", ""), list(IMAGE))
-    wanted = [row["variant"] for row in about["rows"]]
+    kind, wanted = about.get("kind", ""), [row["variant"] for row in about["rows"]]
+    keys = COLUMNS.get(kind, list(IMAGE))
+    factors = [METRICS[key].factor for key in keys]
     present = ablation.scores["psnr"].unstack()[wanted].notna().all(axis=1)
     counted = [subject for subject in ablation.subjects if present[subject]] or ablation.subjects
+    own = ablation.scores.loc[(counted, wanted), keys].groupby("variant").mean().loc[wanted]
     same = ablation.dataset and ablation.dataset == about.get("dataset")
-    same = same and ("subject" not in about or [about["subject"]] == ablation.subjects)
-
-    def published(values: Sequence[float]) -> list[float]:
-        return [value / METRICS[key].factor for key, value in zip(keys, values, strict=True)]
-
-    rows = {}
-    for row in about["rows"]:
-        own = ablation.scores.xs(row["variant"], level="variant").loc[counted, keys].mean().to_dict()
-        paper = (
-            dict(zip((f"{PAPER} {key}" for key in keys), published(row["paper"]), strict=True))
-            if same
-            else {}
-        )
-        note = {NOTE: note_on(row["variant"], ablation, counted), MAIN: row["variant"] == FULL}
-        rows[LABELS[row["variant"]]] = own | paper | note
+    if same and ("subject" not in about or [about["subject"]] == ablation.subjects):
+        paper = pd.DataFrame([row["paper"] for row in about["rows"]], wanted, keys) / factors
+        own = own.join(paper.add_prefix(f"{PAPER} "))
+    own[NOTE] = [note_on(key, ablation, counted) for key in wanted]
+    own[MAIN] = [key == FULL for key in wanted]
+    rows = [own.rename(LABELS)]
     for row in about.get("published", ()):
         if row["dataset"] == ablation.dataset:
-            values = dict(zip(keys, published(row["values"]), strict=True))
-            rows[row["label"]] = {**values, NOTE: "published, on another machine"}
+            published = pd.DataFrame([row["values"]], [row["label"]], keys) / factors
+            rows.append(published.assign(**{NOTE: "published, on another machine", MAIN: False}))
     poses = ", poses refined on them" if ablation.refined else ""
-    caption = CAPTIONS.get(about.get("kind", ""), f"Means over held-out frames{poses}.")
-    frame, ranked = pd.DataFrame.from_dict(rows, orient="index"), about.get("kind", "") != "chance"
-    return Table(about["name"], about["title"], f"{caption} {sizes}", frame, ranked=ranked)
+    caption = CAPTIONS.get(kind, f"Means over held-out frames{poses}.")
+    table = pd.concat(rows).rename_axis(None)
+    return Table(about["name"], about["title"], f"{caption} {remark}", table, ranked=kind != "chance")
 
 
 def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
     """The remarks on a row: who failed, whose avatar is full's own, how many subjects it is a mean of."""
-    notes, several = [], len(ablation.subjects) > 1
+    notes, count = [], len(ablation.subjects)
     for subject in ablation.subjects:
         of, one, full = (
-            f" ({subject})" if several else "",
+            f" ({subject})" if count > 1 else "",
             *(ablation.results[subject, k] for k in (key, FULL)),
         )
         if one.failure:
             notes.append(f"failed{of}: {one.failure}")
         elif key not in (FULL, CHANCE) and not full.failure and avatar_digest(one) == avatar_digest(full):
             notes.append(f"{SAME}{of}")
-    if len(counted) < len(ablation.subjects):
-        notes.append(f"mean of {len(counted)} of {len(ablation.subjects)} subjects")
+    notes += [f"mean of {len(counted)} of {count} subjects"] if len(counted) < count else []
     return "; ".join(notes)
 
 
 def avatar_digest(result: Result) -> str:
     """The digest of the avatar's file, as the store's manifest has it."""
-    manifest = json.loads((result.folders["train"] / MANIFEST).read_text(encoding="utf-8"))
-    return next(file["sha256"] for file in manifest["files"] if file["path"] == "avatar.safetensors")
+    files = (read_manifest(result.folders["train"]) or {"files": []})["files"]
+    return next((file["sha256"] for file in files if file["path"] == "avatar.safetensors"), "")
 
 
 def values_of(tables: Sequence[Table], ablation: Ablation) -> pd.DataFrame:
@@ -279,48 +248,40 @@ def values_of(tables: Sequence[Table], ablation: Ablation) -> pd.DataFrame:
     several = len(ablation.subjects) > 1
     values = [table.values(MEAN if several else ablation.subjects[0]) for table in tables]
     if several:
-        own = ablation.scores.rename_axis(columns="metric").stack().rename("value").reset_index()
+        own = ablation.scores[[*IMAGE, *RUNTIME, *REGIONS]].rename_axis(columns="metric")
+        own = own.stack().rename("value").reset_index()
         own = own.assign(table="each subject", row=own["variant"].map(LABELS), source=HERE).dropna()
         values.append(own[values[0].columns])
     return pd.concat(values, ignore_index=True)
 
 
-def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seconds: float) -> None:
-    """Writes the tables, the plots and the page.
+BARS = (
+    # metric, factor, label, file
+    ("psnr", 1, "PSNR against full, dB", "worth_psnr.png"),
+    ("lpips_alex", 100, "LPIPS×100 against full, less is better", "worth_lpips.png"),
+)
 
-    Args:
-        folder: where they go.
-        name: of the study.
-        ablation: its results.
-        base: a subject's, for the settings.
-        seconds: of this call.
-    """
+
+def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seconds: float) -> None:
+    """Writes the tables, the plots and the page, with one subject's settings and the seconds of this call."""
     pictures = []
-    for metric, label, file, factor in (
-        ("psnr", "PSNR against full, dB", "worth_psnr.png", 1),
-        ("lpips_alex", "LPIPS×100 against full, less is better", "worth_lpips.png", 100),
-    ):
+    for metric, factor, label, file in BARS:
         gains = factor * ablation.gains(metric)
-        own = pd.Series({one.name: gains[key] for key, one in VARIANTS.items() if key != FULL})
-        bars(folder / file, own, label, gains[CHANCE], higher_is_better=metric == "psnr")
+        shown = gains.reindex(list(VARIANTS)).drop(FULL).rename(LABELS)
+        bars(folder / file, shown, label, gains[CHANCE], METRICS[metric].better == "higher")
         pictures.append((folder / file, f"{label}; grey: by how much another seed differs."))
     several = len(ablation.subjects) > 1
-    done = [one for one in ablation.results.values() if not one.failure]
     tables = tables_of(ablation, sizes_of(base.settings))
     changed = {one.name: one.overrides for one in variants_of(base).values()}
-    results = {f"{one.subject}, {one.variant}" if several else one.variant: one for one in done}
-    page = Page(
-        title=f"{name}: what each part is worth",
-        lead=headline(ablation),
-        lines=[f"Subjects: {', '.join(ablation.subjects)}."] if several else [],
-        sections=[
-            Section("At a glance", pictures=pictures),
-            Section("The paper's tables", tables=tables),
-            settings_section(base.settings, changed),
-            timings_section(results, seconds),
-        ],
-    )
-    publish(folder, page, tables, values_of(tables, ablation))
+    results = {f"{o.subject}, {o.variant}" if several else o.variant: o for o in ablation.results.values()}
+    sections = [
+        Section("At a glance", pictures=pictures),
+        Section("The paper's tables", tables=tables),
+        *closing_sections(base, changed, results, seconds),
+    ]
+    lines = [f"Subjects: {', '.join(ablation.subjects)}."] if several else []
+    page = Page(f"{name}: what each part is worth", headline(ablation), lines, sections)
+    publish(folder, page, values_of(tables, ablation))
 
 
 def headline(ablation: Ablation) -> str:
@@ -328,20 +289,17 @@ def headline(ablation: Ablation) -> str:
     gains = ablation.gains("psnr")
     chance = gains[CHANCE]
     noise = chance if math.isfinite(chance) else 0.0
-    gains = gains[[key for key in VARIANTS if key != FULL]].dropna()
+    gains = gains.reindex(list(VARIANTS)).drop(FULL).dropna().rename(LABELS)
     if gains.empty:
         return "No variant could be compared with the whole method."
     parts = []
-    for key, word, counts in (
-        (gains.idxmin(), "costs", gains.min() < -noise),
-        (gains.idxmax(), "gains", gains.max() > noise),
-    ):
-        if counts:
-            parts.append(f"{VARIANTS[key].name} {word} most: {gains[key]:+.2f} dB")
+    if gains.min() < -noise:
+        parts.append(f"{gains.idxmin()} costs most: {gains.min():+.2f} dB")
+    if gains.max() > noise:
+        parts.append(f"{gains.idxmax()} gains most: {gains.max():+.2f} dB")
     within = (gains.abs() <= chance).sum()
     if within:
-        parts.append(
-            f"{within} of {len(gains)} variants differ by no more than another seed does ({noise:.2f} dB)"
-        )
+        others = f"{within} of {len(gains)} variants differ"
+        parts.append(f"{others} by no more than another seed does ({noise:.2f} dB)")
     text = "; ".join(parts) or "no variant differs from the whole method"
     return f"{text[0].upper()}{text[1:]}."

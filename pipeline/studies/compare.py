@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -16,11 +14,11 @@ from pipeline.config.request import Request
 from pipeline.errors import UserError
 from pipeline.run.job import open_job, shown
 from pipeline.run.stage import usual
-from pipeline.store.artifact import Artifact, Store
+from pipeline.store.artifact import Store
 from pipeline.store.digest import write_atomically
-from pipeline.studies.tables import pipe_table
+from pipeline.studies.tables import MEAN, pipe_table
+from pipeline.studies.variants import held_out_means, read_summary
 
-MEAN = "mean"
 DIGITS = {"psnr": 2, "ssim": 3, "lpips_alex": 2}
 AVATAR, REFINED = "avatar", "avatar_refined"
 OURS = {
@@ -29,9 +27,22 @@ OURS = {
     "nearest_frame": "here, nearest training frame",
 }
 
-Summary = Mapping[str, Any]
-"""One subject's ``means`` by method, ``protocol``, ``background``, ``render_mask``; and whether it is
-``current``, made under these settings."""
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """One subject's result.
+
+    Attributes:
+        means: method -> metric -> mean over the held-out frames, None where it has none.
+        protocol, background, render_mask: how it was measured.
+        current: whether it was made under the settings that are asked for.
+    """
+
+    means: Mapping[str, Mapping[str, float | None]]
+    protocol: str = ""
+    background: str = "black"
+    render_mask: str = OWN
+    current: bool = True
 
 
 def compare(dataset: str, request: Request) -> Path:
@@ -43,16 +54,15 @@ def compare(dataset: str, request: Request) -> Path:
     workspace = request.workspace
     about, subjects = load_dataset(workspace, dataset), subjects_of(workspace, dataset)
     request = dataclasses.replace(request, subjects=())  # each is what its own file says
-    summaries = {subject: summary_of(subject, request) for subject in subjects}
-    found = {subject: one for subject, one in summaries.items() if one}
-    text = comparison(about, subjects, found)
+    measured = {subject: measured_of(subject, request) for subject in subjects}
+    text = comparison(about, subjects, {subject: one for subject, one in measured.items() if one})
     path = workspace.artifacts / "compare" / f"{dataset}.md"
     write_atomically(path, text)
     print(f"{text}\nwritten to {shown(path)}")
     return path
 
 
-def summary_of(subject: str, request: Request) -> Summary | None:
+def measured_of(subject: str, request: Request) -> Measured | None:
     """A subject's result that is asked for, else the one in use, else None."""
     job = open_job(subject, request)
     last = "evaluate" if "evaluate" in job.stages else usual(job.stages)[-1]
@@ -61,25 +71,15 @@ def summary_of(subject: str, request: Request) -> Summary | None:
     except UserError:  # the footage is not here any more; the result may be
         current = None
     artifact = current or Store(job.workspace.artifacts).latest(subject, last)
-    return {**read_summary(artifact), "current": current is not None} if artifact else None
+    if artifact is None:
+        return None
+    summary = read_summary(artifact.folder)
+    mask = summary.get("choices", {}).get("render_mask", OWN)
+    how = (str(one) for one in (summary.get("protocol", ""), summary.get("background", "black"), mask))
+    return Measured(held_out_means(summary), *how, current=current is not None)
 
 
-def read_summary(artifact: Artifact) -> dict[str, Any]:
-    """The means and the protocol that evaluate wrote; UserError where its file is damaged."""
-    path = artifact.folder / "summary.json"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            "means": summary["means"]["test"],
-            "protocol": str(summary.get("protocol", "")),
-            "background": str(summary.get("background", "black")),
-            "render_mask": str(summary.get("choices", {}).get("render_mask", OWN)),
-        }
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
-
-
-def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Summary]) -> str:
+def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> str:
     """The table as Markdown, with remarks below.
 
     Args:
@@ -91,12 +91,12 @@ def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Summ
     columns = [*(subject for subject in subjects if subject in published or subject in found), MEAN]
     rows = {f"{row.method} (published)": scores(row.values, subjects) for row in about.rows}
     for method, name in OURS.items():
-        measured = {subject: one["means"][method] for subject, one in found.items() if method in one["means"]}
-        if measured:
-            values = {s: [means.get(metric) for metric in DIGITS] for s, means in measured.items()}
-            part = "" if len(measured) == len(subjects) else f" ({len(measured)} of {len(subjects)} subjects)"
+        means = {subject: one.means[method] for subject, one in found.items() if method in one.means}
+        if means:
+            part = "" if len(means) == len(subjects) else f" ({len(means)} of {len(subjects)} subjects)"
             name = f"**{name}**" if method == counted(about) else name
-            rows[f"{name}{part}"] = scores(values, list(measured)).mul([1, 1, 100], axis=0)
+            values = {subject: [one.get(metric) for metric in DIGITS] for subject, one in means.items()}
+            rows[f"{name}{part}"] = scores(values, list(means)).mul([1, 1, 100], axis=0)
     texts = pd.DataFrame({name: row.reindex(columns=columns).apply(cell) for name, row in rows.items()}).T
     texts.insert(0, "method", texts.index)
     under = f", {about.table}" if about.table else ""
@@ -130,35 +130,29 @@ def wanted(about: Dataset) -> Protocol:
     return chosen(about.layer.tables.get("evaluate", {}))
 
 
-def remarks(about: Dataset, subjects: Sequence[str], found: Mapping[str, Summary]) -> list[str]:
+def remarks(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> list[str]:
     """Sentences below the table: which row to compare, and what was not measured as the published numbers."""
     said = [f"Published numbers: {about.protocol}"] if about.protocol else []
-    said += [f"Measured here: {one}" for one in sorted({one["protocol"] for one in found.values()} - {""})]
-    not_alike = []
+    said += [f"Measured here: {one}" for one in sorted({one.protocol for one in found.values()} - {""})]
+
+    def name_those(remark: str, exempt: Callable[[Measured], bool]) -> None:
+        others = [subject for subject, one in found.items() if not exempt(one)]
+        said.extend([f"{remark}: {', '.join(others)}"] if others else [])
+
     if found and about.rows:
+        asked, unlike = wanted(about), "Not comparable, the published numbers"
         said.append(f"The row to compare is '{OURS[counted(about)]}'")
-        not_alike.append(("test poses were not refined", lambda one: counted(about) in one["means"]))
+        name_those("Not comparable, test poses were not refined", lambda one: counted(about) in one.means)
         if {"protocol", "background"} & set(about.layer.tables.get("evaluate", {})):
-            protocol = wanted(about)
+            own = asked.render_mask == OWN
             mask = (
                 "leave the render its own alpha"
-                if protocol.render_mask == OWN
-                else f"have the {protocol.render_mask}'s mask on both pictures"
+                if own
+                else f"have the {asked.render_mask}'s mask on both pictures"
             )
-            not_alike += [
-                (
-                    f"the published numbers are on {protocol.background}",
-                    lambda one: one["background"] == protocol.background,
-                ),
-                (f"the published numbers {mask}", lambda one: one["render_mask"] == protocol.render_mask),
-            ]
-    for reason, alike in not_alike:
-        other = [subject for subject, one in found.items() if not alike(one)]
-        said += [f"Not comparable, {reason}: {', '.join(other)}"] if other else []
+            name_those(f"{unlike} are on {asked.background}", lambda one: one.background == asked.background)
+            name_those(f"{unlike} {mask}", lambda one: one.render_mask == asked.render_mask)
     missing = [subject for subject in subjects if subject not in found]
-    if missing:
-        said.append(f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}")
-    other = [subject for subject, one in found.items() if not one["current"]]
-    if other:
-        said.append(f"Under other settings than are asked for: {', '.join(other)}")
+    said += [f"Not run: {', '.join(missing)}; doit run subject={','.join(missing)}"] if missing else []
+    name_those("Under other settings than are asked for", lambda one: one.current)
     return said

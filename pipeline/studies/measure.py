@@ -8,10 +8,11 @@ pixels, as in the paper's runtime table.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from pipeline.numba_kernels import threads
 from pipeline.run.job import Job
 from pipeline.splat import Gaussians, render
 from pipeline.store.digest import write_atomically
+from pipeline.studies.tables import METRICS
 from pipeline.studies.variants import Result
 
 SIDE = 512  # pixels of the picture that speed is measured at
@@ -86,14 +88,18 @@ class AvatarMeter:
         self.lpips = Lpips(require(job.workspace, "lpips"), "alex")
         self.cache = MeasurementCache(job.workspace.data / "studies" / "measured" / job.subject.name)
 
-    def quality(self, result: Result) -> Numbers:
-        """PSNR, PSNR inside the mask, SSIM and LPIPS, means over the clip's held-out frames.
+    def measured(self, result: Result) -> Result:
+        """A result whose means are PSNR, PSNR inside the mask, SSIM and LPIPS of held-out frames.
 
-        Poses are those of the result's own fit; the camera is the clip's, so that pictures have its size.
+        Poses are those of the result's own fit; the camera is the clip's, so that pictures have its size. A
+        failure stays what it is.
         """
+        if result.failure:
+            return result
         train, fit = (result.folders[stage].name for stage in ("train", "fit"))
         name = f"quality_{train}_{fit}_{self.ingest.name}_{self.background}"
-        return self.cache.get(name, lambda: self._quality(result))
+        quality = self.cache.get(name, lambda: self._quality(result))
+        return dataclasses.replace(result, means={"avatar": quality})
 
     @torch.no_grad()
     def _quality(self, result: Result) -> Numbers:
@@ -123,8 +129,8 @@ class AvatarMeter:
         baked = bake(load_avatar(result.folders["train"] / "avatar.safetensors", self.body))
         return clip, lambda frame: baked.gaussians(clip.pose(frame), clip.seconds.get(frame))
 
-    def speeds(self, results: Sequence[Result]) -> dict[str, Numbers]:
-        """Size and time of a frame of each finished avatar: name of the train version -> numbers.
+    def speeds(self, results: Iterable[Result]) -> dict[Path, Numbers]:
+        """Size and time of a frame of each finished avatar: folder of the train version -> numbers.
 
         Avatars that are not in the cache take turns, frame by frame, in this process and on one thread: what
         else the machine does then falls on all alike. The least of ``REPEATS`` frames is taken.
@@ -133,35 +139,59 @@ class AvatarMeter:
             ``gaussians``; ``asset_mib``, a Gaussian's mean, opacity, scale, rotation and colour in float32;
             ``animation_ms`` and ``rendering_ms``, processor milliseconds.
         """
-        by_name = {one.folders["train"].name: one for one in results}
-        entries = {name: f"speed_{name}_{self.ingest.name}_{SIDE}" for name in by_name}
-        known = {name: self.cache.read(entry) for name, entry in entries.items()}
-        unknown = {name: self._posed(by_name[name]) for name, numbers in known.items() if numbers is None}
-        with threads(1):
-            timed = self._timed(unknown) if unknown else {}
-        known |= {name: self.cache.write(entries[name], numbers) for name, numbers in timed.items()}
-        return {name: numbers for name, numbers in known.items() if numbers is not None}
+        avatars = {one.folders["train"]: one for one in results if not one.failure}
+        entries = {folder: f"speed_{folder.name}_{self.ingest.name}_{SIDE}" for folder in avatars}
+        found = {folder: self.cache.read(entry) for folder, entry in entries.items()}
+        unknown = {folder: self._posed(avatars[folder]) for folder, known in found.items() if known is None}
+        if unknown:
+            print(f"timing {len(unknown)} avatars in motion", flush=True)
+            with threads(1):
+                timed = self._timed(unknown)
+            found |= {folder: self.cache.write(entries[folder], numbers) for folder, numbers in timed.items()}
+        return {folder: numbers for folder, numbers in found.items() if numbers is not None}
 
     @torch.no_grad()
-    def _timed(self, avatars: Mapping[str, tuple[FittedClip, Posed]]) -> dict[str, Numbers]:
+    def _timed(self, avatars: Mapping[Path, tuple[FittedClip, Posed]]) -> dict[Path, Numbers]:
         clip, _ = next(iter(avatars.values()))
         frames = clip.spread(POSES, "test") or clip.spread(POSES)
         camera, found = square(clip.cameras[frames[0]]), {}
-        for name, (_, posed) in avatars.items():  # the first frame compiles and warms up
+        for folder, (_, posed) in avatars.items():  # the first frame compiles and warms up
             gaussians = posed(frames[0])
             render(gaussians, camera)
             floats = sum(tensor.numel() for tensor in gaussians.tensors())
-            found[name] = {"gaussians": float(len(gaussians.means)), "asset_mib": 4 * floats / 2**20}
+            found[folder] = {"gaussians": float(len(gaussians.means)), "asset_mib": 4 * floats / 2**20}
         for repeat in range(REPEATS):
-            for name, (_, posed) in avatars.items():
+            for folder, (_, posed) in avatars.items():
                 start = time.process_time()
                 gaussians = posed(frames[(repeat + 1) % len(frames)])
                 middle = time.process_time()
                 render(gaussians, camera)
                 took = {"animation_ms": middle - start, "rendering_ms": time.process_time() - middle}
                 for key, seconds in took.items():
-                    found[name][key] = min(1e3 * seconds, found[name].get(key, math.inf))
+                    found[folder][key] = min(1e3 * seconds, found[folder].get(key, math.inf))
         return found
+
+
+def score_table(
+    results: Sequence[Result], speeds: Mapping[Path, Numbers], method: str = "avatar"
+) -> pd.DataFrame:
+    """A row a result: its scores of held-out frames, what it took to make it, and what a frame of it costs.
+
+    Args:
+        results: failures too, whose scores are NaN.
+        speeds: as ``AvatarMeter.speeds`` gives them.
+        method: of evaluate, whose scores count.
+
+    Returns:
+        Columns are the keys of ``METRICS``; ``train_s`` and ``whole_s`` are processor seconds.
+    """
+    rows = [one.held_out(method) | speeds.get(one.folders.get("train"), {}) for one in results]
+    scores = pd.DataFrame(rows, range(len(rows))).reindex(columns=list(METRICS)).astype(float)
+    scores["train_s"] = [one.training_cost for one in results]
+    scores["whole_s"] = [math.nan if one.failure else sum(one.cpu_seconds.values()) for one in results]
+    scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
+    scores["fps"] = 1e3 / scores["total_ms"]
+    return scores
 
 
 def square(camera: Camera) -> Camera:

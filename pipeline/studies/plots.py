@@ -23,6 +23,11 @@ MARKS: Mapping[str, Mapping] = {
     "base": {"marker": "D", "markersize": 7, "color": INK, "zorder": 4},
     "preset": {"marker": "*", "markersize": 13, "color": ORANGE, "zorder": 5},
 }
+NUMBERS: Mapping[bool, Mapping] = {
+    True: {"color": BLUE, "fontsize": 8, "fontweight": "bold", "zorder": 6},
+    False: {"color": "#6b747c", "fontsize": 8, "fontweight": "normal", "zorder": 6},
+}
+"""The letters of a point's number, on the frontier or not."""
 
 
 def scatter(
@@ -48,8 +53,7 @@ def scatter(
     entries = {}
     for number, point in points.iterrows():
         preset, base = point.get("preset") or "", bool(point.get("base"))
-        beaten = "frontier" if number in frontier else "beaten"
-        kind = "preset" if preset else "base" if base else beaten
+        kind = "preset" if preset else "base" if base else "frontier" if number in frontier else "beaten"
         (mark,) = axes.plot(point["x"], point["y"], linestyle="none", **MARKS[kind])
         entries[f"preset {preset}" if preset else kind] = mark
     edge = points[points.index.isin(frontier)].sort_values("x")
@@ -57,41 +61,19 @@ def scatter(
     for name, x in (expected or {}).items():
         if x <= REACH * points["x"].max():
             axes.axvline(x, color=ORANGE, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-            axes.text(
-                x,
-                0.02,
-                f" {name}",
-                color=ORANGE,
-                fontsize=8,
-                rotation=90,
-                transform=axes.get_xaxis_transform(),
-            )
+            place = {"rotation": 90, "transform": axes.get_xaxis_transform()}
+            axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, **place)
     _log_axis(axes, points["x"])
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
     figure.canvas.draw()  # places the axes, which labels are moved in
     labels = [
-        axes.text(
-            point["x"],
-            point["y"],
-            str(number),
-            color=BLUE if number in frontier else "#6b747c",
-            fontsize=8,
-            fontweight="bold" if number in frontier else "normal",
-            zorder=6,
-        )
+        axes.text(point["x"], point["y"], str(number), **NUMBERS[number in frontier])
         for number, point in points.iterrows()
     ]
     if labels:
-        adjust_text(
-            labels,
-            points["x"].tolist(),
-            points["y"].tolist(),
-            ax=axes,
-            expand=(1.8, 1.9),
-            force_text=(0.3, 0.3),
-            iter_lim=300,
-            arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.6},
-        )
+        places, arrows = (points[name].tolist() for name in "xy"), {"arrowstyle": "-", "color": GREY}
+        looks = {"expand": (1.8, 1.9), "arrowprops": {**arrows, "linewidth": 0.6}}
+        adjust_text(labels, *places, ax=axes, force_text=(0.3, 0.3), iter_lim=300, **looks)
     _save(figure, path)
 
 
@@ -129,9 +111,8 @@ def bars(path: Path, values: pd.Series, label: str, noise: float, higher_is_bett
     figure, axes = _figure(label, "", (SIZE[0], 0.9 + 0.36 * max(3, len(known))))
     colors = [ORANGE if (value < 0) == higher_is_better else BLUE for value in known]
     drawn = axes.barh(known.index, known, color=colors, height=0.62, zorder=3)
-    axes.bar_label(
-        drawn, [f"{round(value, 2) + 0.0:+.2f}" for value in known], padding=3, fontsize=8, color=INK
-    )
+    texts = [f"{round(value, 2) + 0.0:+.2f}" for value in known]
+    axes.bar_label(drawn, texts, padding=3, fontsize=8, color=INK)
     axes.axvline(0, color=INK, linewidth=0.8, zorder=4)
     if math.isfinite(noise):
         axes.axvspan(-abs(noise), abs(noise), color=GREY, alpha=0.3, zorder=1)

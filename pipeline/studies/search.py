@@ -5,16 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 
 import pandas as pd
 
 from pipeline.errors import UserError
-from pipeline.studies.sweep import CHANCE, Design, Level, label_of, overrides_of
+from pipeline.studies.measure import Numbers, score_table
+from pipeline.studies.sweep import CHANCE, Design, Level, label_of, overrides_of, shortfalls
 from pipeline.studies.variants import Base, Result, Variant
-
-UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-TRAIN, VIEWS = "train", "auxiliary"
 
 
 def seconds_of(text: str) -> float:
@@ -23,12 +22,11 @@ def seconds_of(text: str) -> float:
     Raises:
         UserError: it is none of these, or not more than nothing.
     """
-    number, unit = (text[:-1], text[-1]) if text and text[-1] in UNITS else (text, "s")
     try:
-        seconds = float(number) * UNITS[unit]
+        seconds = pd.Timedelta(text if text[-1:].isalpha() else f"{text}s").total_seconds()
     except ValueError:
         seconds = math.nan
-    if not 0 < seconds < math.inf:
+    if not seconds > 0:
         raise UserError(f"budget={text}: is no length of time; write 90s, 20m or 2h")
     return seconds
 
@@ -41,11 +39,6 @@ def spoken(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-def training_cost(result: Result) -> float:
-    """Processor seconds of training and of the views made for it; NaN of a failure."""
-    return math.nan if result.failure else sum(result.cpu_seconds.get(stage, 0.0) for stage in (TRAIN, VIEWS))
-
-
 @dataclasses.dataclass
 class Search:
     """One subject's designs in the making; what is affordable is judged by what has been made so far.
@@ -53,18 +46,16 @@ class Search:
     Attributes:
         base: whose avatar, and the settings that designs override.
         budget: seconds of this call; results that the store holds cost nothing of it.
-        psnr_of: a function: result -> its quality in dB; the base's is asked for first.
+        measure: a function: result -> the same with its scores; the base's is asked for first.
         clock: a function: the present second.
         results: design -> result, in the order of their making.
-        psnr: design -> quality in dB, NaN where it failed.
     """
 
     base: Base
     budget: float
-    psnr_of: Callable[[Result], float]
+    measure: Callable[[Result], Result]
     clock: Callable[[], float] = time.monotonic
     results: dict[Design, Result] = dataclasses.field(default_factory=dict)
-    psnr: dict[Design, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._start = self.clock()
@@ -76,8 +67,7 @@ class Search:
 
     def make(self, design: Design) -> Result:
         """Makes one design up to its trained avatar and measures it."""
-        variant = Variant(label_of(design), overrides_of(design))
-        self.results[design], self.psnr[design] = self.run(self.base, variant)
+        self.results[design] = self.run(self.base, Variant(label_of(design), overrides_of(design)))
         return self.results[design]
 
     def make_affordable(self, designs: Iterable[Design]) -> None:
@@ -87,46 +77,60 @@ class Search:
             if not seconds or seconds <= self.budget - self.spent:
                 self.make(design)
 
-    def run(self, base: Base, variant: Variant) -> tuple[Result, float]:
-        """Makes a variant up to its trained avatar, prints a line on it, and returns its PSNR, too."""
-        result = base.run(variant, [TRAIN])
-        psnr = math.nan if result.failure else self.psnr_of(result)
-        done = f"{psnr:.2f} dB, trained in {training_cost(result):.0f} processor seconds"
-        line = f"failed: {result.failure}" if result.failure else done
-        spent = f"[{spoken(self.spent)} of {spoken(self.budget)}]"
-        print(f"{spent} {result.subject}, {result.variant}: {line}", flush=True)
-        return result, psnr
+    def run(self, base: Base, variant: Variant) -> Result:
+        """Makes a variant up to its trained avatar, measures it and prints a line on it."""
+        result = self.measure(base.run(variant, ["train"]))
+        print(f"[{spoken(self.spent)} of {spoken(self.budget)}] {result.line}", flush=True)
+        return result
 
     def expected_seconds(self, design: Design) -> float:
-        """Wall-clock seconds that the stages of a design that the store lacks are expected to take."""
-        seconds = {stage: self.results[()].seconds.get(stage, 0.0) for stage in self.missing(design)}
-        if TRAIN in seconds:
-            seconds[TRAIN] *= math.prod(map(self.cost_ratio, design))
-        return sum(seconds.values())
+        """Wall-clock seconds that the stages of a design that the store lacks are expected to take.
 
-    def missing(self, design: Design) -> list[str]:
-        """The stages of a design that the store lacks; none where a setting is wrong, which running tells."""
+        None of it where a setting is wrong, which running tells.
+        """
         try:
-            return self.base.missing(TRAIN, overrides_of(design))
+            missing = self.base.missing("train", overrides_of(design))
         except UserError:
-            return []
+            return 0.0
+        seconds = {stage: self.results[()].seconds.get(stage, 0.0) for stage in missing}
+        if "train" in seconds:
+            seconds["train"] *= math.prod(map(self.cost_ratio, design))
+        return sum(seconds.values())
 
     def cost_ratio(self, level: Level) -> float:
         """Training cost of a level alone over the base's; the guess of it where it has not been made."""
-        cost = training_cost(self.results[(level,)]) if (level,) in self.results else math.nan
-        ratio = cost / max(training_cost(self.results[()]), 1e-9)
+        cost = self.results[(level,)].training_cost if (level,) in self.results else math.nan
+        ratio = cost / max(self.results[()].training_cost, 1e-9)
         return ratio if 0 < ratio < math.inf else level.factor
 
-    @property
-    def noise(self) -> float:
-        """How far another seed's quality is off, dB; NaN where it was not made."""
-        seeds = [psnr for design, psnr in self.psnr.items() if design and design[0].parameter == CHANCE]
-        return abs(seeds[0] - self.psnr[()]) if seeds else math.nan
+    def points(self) -> pd.DataFrame:
+        """The designs that have been made so far; see ``point_table``."""
+        return point_table([(result, design, "") for design, result in self.results.items()])
 
-    def alone(self) -> pd.DataFrame:
-        """The base and the levels that were tried alone, but for another seed; see ``combinations``."""
-        rows: list[tuple[Level | None, float, float]] = [(None, 0.0, 1.0)]
-        for level in (design[0] for design in self.results if len(design) == 1):
-            if level.parameter != CHANCE:
-                rows.append((level, self.psnr[(level,)] - self.psnr[()], self.cost_ratio(level)))
-        return pd.DataFrame(rows, columns=["level", "gain", "ratio"])
+
+Run = tuple[Result, Design | None, str]
+"""A result, its design (None for a preset), and the preset that it is (empty if none)."""
+
+
+def point_table(runs: Sequence[Run], speeds: Mapping[Path, Numbers] | None = None) -> pd.DataFrame:
+    """The points of a tradeoff, numbered from 1, in the order of their making.
+
+    Args:
+        runs: the base's first.
+        speeds: as ``AvatarMeter.speeds`` gives them.
+
+    Returns:
+        The columns of ``score_table``, ``result``, ``design`` and ``preset`` as in ``runs``, ``label``;
+        ``times``, training cost over the base's; ``gain``, dB over the base; ``chance``, true of another
+        seed, which is no choice; and ``short``, dB under the frontier, of the others.
+    """
+    results, designs, presets = zip(*runs, strict=True)
+    points = score_table(results, speeds or {})
+    points = points.assign(result=results, preset=presets, label=[one.variant for one in results])
+    points["design"] = pd.Series(designs, dtype=object)
+    points["chance"] = [bool(design) and design[0].parameter == CHANCE for design in designs]
+    points["times"] = points["train_s"] / max(points["train_s"].iloc[0], 1e-9)
+    points["gain"] = points["psnr"] - points["psnr"].iloc[0]
+    choices = points[~points["chance"]]
+    points["short"] = shortfalls(choices["train_s"], choices["psnr"])
+    return points.set_axis(points.index + 1)

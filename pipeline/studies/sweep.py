@@ -9,14 +9,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pandas as pd
+
+from pipeline.studies.variants import Settings, another_seed
 
 SUBDIVISIONS = ("no subdivision", "one subdivision", "two subdivisions")
 CHANCE = "chance"  # the parameter that buys nothing: another seed
-GAUSSIANS, PRECISION = "number of Gaussians", "precision"
+GAUSSIANS, PRECISION, REPRESENTATION = "number of Gaussians", "precision", "representation"
+EDGES = (1.5, 0.7)  # times the base's longest edge between Gaussians
 MOST_COMBINED = 6  # levels that combinations are made of: 15 pairs, 20 triples, ...
 
 
@@ -54,7 +58,8 @@ def overrides_of(design: Design) -> dict[str, str]:
 
 SCALED = (
     # parameter, its setting, factors, what the number is a multiple of, exponent of training time, in words
-    ("iterations", "train.iterations", (0.5, 2.0, 4.0), 1, 1.0, "{:,} iterations"),
+    ("steps", "train.iterations", (0.5, 2.0, 4.0), 1, 1.0, "{:,} iterations"),
+    ("steps", "train.effort", (0.5, 2.0, 4.0), 0.01, 1.0, "{:g} times the plan's steps"),
     ("image size", "", (0.5, 1.5), 8, 0.5, "{} px"),
     ("fit effort", "fit.iterations", (0.25, 2.0), 1, 0.0, "fit of {} steps"),
 )
@@ -70,42 +75,35 @@ SWITCHED = (
 )
 
 
-def sweep_levels(settings: Mapping[str, Any]) -> list[Level]:
-    """Every level to try alone: each parameter's first before any parameter's second, the fastest first.
-
-    Args:
-        settings: stage -> settings of the base.
-    """
-    train = settings["train"]
-    half, words, seed = train.half_precision, ("float32", "bfloat16"), train.seed
-    precision = (("train.half_precision", str(not half).lower()),)
-    parameters = [
+def sweep_levels(settings: Settings) -> list[Level]:
+    """Every level to try alone: each parameter's first before any parameter's second, the fastest first."""
+    levels = [
         *_scaled(settings),
-        _gaussians(train, settings["plan"]),
-        [Level(PRECISION, words[half], words[not half], precision, 1.5)],
+        *_gaussians(settings),
+        *_kinds(settings),
         *_switched(settings),
-        [Level(CHANCE, f"seed {seed}", f"seed {seed + 1}", (("train.seed", str(seed + 1)),))],
+        _chance(settings),
     ]
-    ranked = [(depth, level) for levels in parameters for depth, level in enumerate(levels)]
-    return [level for _, level in sorted(ranked, key=lambda one: (one[0], one[1].factor))]
+    parameters = pd.Series([level.parameter for level in levels])
+    depths = parameters.groupby(parameters).cumcount()
+    return [level for _, level in sorted(zip(depths, levels, strict=True), key=lambda x: (x[0], x[1].factor))]
 
 
-def _scaled(settings: Mapping[str, Any]) -> list[list[Level]]:
-    """Parameters whose levels are multiples of the base's own number."""
-    found = []
+def _scaled(settings: Settings) -> Iterator[Level]:
+    """Multiples of the base's own number."""
     for parameter, name, factors, multiple, exponent, words in SCALED:
         name = name or picture_setting(settings["ingest"])
         own = setting_of(settings, name)
-        values = {factor: multiple * round(own * factor / multiple) for factor in factors}
-        found.append([
-            Level(parameter, words.format(own), words.format(value), ((name, str(value)),), factor**exponent)
-            for factor, value in values.items()
-            if value
-        ])  # fmt: skip
-    return found
+        if name == "train.effort" and settings["train"].iterations:
+            continue  # it is without effect then
+        for factor in factors:
+            value = round(multiple * round(own * factor / multiple), 2)
+            if value:
+                overrides = ((name, str(value)),)
+                yield Level(parameter, words.format(own), words.format(value), overrides, factor**exponent)
 
 
-def setting_of(settings: Mapping[str, Any], name: str) -> Any:
+def setting_of(settings: Settings, name: str) -> Any:
     """The value of a setting such as ``train.iterations``."""
     stage, _, field = name.partition(".")
     return getattr(settings[stage], field)
@@ -116,82 +114,112 @@ def picture_setting(ingest: Any) -> str:
     return "ingest.mannequin_size" if ingest.mannequin else "ingest.long_side"
 
 
-def _gaussians(train: Any, plan: Any) -> list[Level]:
-    """Levels of subdivision whatever the pixels; the base's own is what the plan leaves of it."""
-    own = 0 if plan.subdivision == "off" else train.subdivisions
-    planned = own > 0 and plan.subdivision == "auto"  # then nobody knows yet which of them it is
-    overrides = [(("train.subdivisions", str(count)), ("plan.subdivision", "on")) for count in range(3)]
-    return [
-        Level(GAUSSIANS, mesh_of(train, plan), label, overrides[count], 1.8 ** (count - own))
-        for count, label in enumerate(SUBDIVISIONS)
-        if planned or count != own
-    ]
+def _kinds(settings: Settings) -> Iterator[Level]:
+    """The other representation, and the other precision where heads have one."""
+    train = settings["train"]
+    if is_triplane(settings):
+        words = ("float32", "bfloat16")
+        overrides = (("train.half_precision", str(not train.half_precision).lower()),)
+        yield Level(PRECISION, words[train.half_precision], words[not train.half_precision], overrides, 1.5)
+        yield Level(REPRESENTATION, "triplane", "bases", (("train.representation", "bases"),), 0.2)
+    else:
+        yield Level(REPRESENTATION, "bases", "triplane", (("train.representation", "triplane"),), 5.0)
 
 
-def mesh_of(train: Any, plan: Any) -> str:
-    """The fineness of a run's mesh in words.
-
-    Args:
-        train, plan: the two stages' settings.
-    """
-    own = 0 if plan.subdivision == "off" else train.subdivisions
-    return f"at most {SUBDIVISIONS[own]}" if own and plan.subdivision == "auto" else SUBDIVISIONS[own]
+def is_triplane(settings: Settings) -> bool:
+    """True where the avatar is a triplane."""
+    return settings["train"].representation == "triplane"
 
 
-def _switched(settings: Mapping[str, Any]) -> list[list[Level]]:
+def _gaussians(settings: Settings) -> Iterator[Level]:
+    """The density of the Gaussians: of bases the longest edge, of a triplane levels of subdivision."""
+    if not is_triplane(settings):
+        own = settings["plan"].edge_pixels
+        for factor in EDGES:
+            text = f"{round(own * factor, 1):g}"
+            overrides = (("plan.edge_pixels", text),)
+            yield Level(GAUSSIANS, mesh_of(settings), f"edges of {text} px", overrides, factor**-1.0)
+        return
+    mesh = mesh_of(settings)
+    own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
+    for count, label in enumerate(SUBDIVISIONS):
+        if label != mesh:  # "at most one": nobody knows yet whether it is none or one
+            overrides = (("train.subdivisions", str(count)), ("plan.subdivision", "on"))
+            yield Level(GAUSSIANS, mesh, label, overrides, 1.8 ** (count - own))
+
+
+def mesh_of(settings: Settings) -> str:
+    """The fineness of a run's mesh in words."""
+    if not is_triplane(settings):
+        return f"edges of {settings['plan'].edge_pixels:g} px"
+    plan = settings["plan"].subdivision
+    own = 0 if plan == "off" else settings["train"].subdivisions
+    return f"at most {SUBDIVISIONS[own]}" if own and plan == "auto" else SUBDIVISIONS[own]
+
+
+def _switched(settings: Settings) -> Iterator[Level]:
     """Each part that the base has left out, and each that it lacks and could have added."""
-    train, found = settings["train"], []
+    train = settings["train"]
     idle = {  # parts that other settings of the base leave nothing to do
         "pose heads": train.pose_heads_from >= 1,
-        "residual colours": not train.residual_parts,
+        "residual colours": not train.residual_parts or not is_triplane(settings),
         "visibility gate": not train.gate,
         "pose refinement": not train.refine_poses,
     }
     for part, setting, off, on, factor in SWITCHED:
         has, with_it, without = setting_of(settings, setting) != off, f"with {part}", f"without {part}"
         if has and not idle.get(part):
-            found.append([Level(part, with_it, without, ((setting, str(off)),), 1 / factor)])
+            yield Level(part, with_it, without, ((setting, str(off)),), 1 / factor)
         elif not has and on is not None:
             with_it += f" ({on})" if on != "auto" else ""
-            found.append([Level(part, without, with_it, ((setting, str(on)),), factor)])
-    return found
+            yield Level(part, without, with_it, ((setting, str(on)),), factor)
 
 
-def combinations(alone: pd.DataFrame, noise: float) -> list[Design]:
+def _chance(settings: Settings) -> Level:
+    """Another seed."""
+    overrides = tuple(another_seed(settings).overrides.items())
+    return Level(CHANCE, f"seed {settings['train'].seed}", f"seed {overrides[0][1]}", overrides)
+
+
+def noise_of(points: pd.DataFrame) -> float:
+    """How far another seed's PSNR is off, dB; NaN where none was reached."""
+    return points.loc[points["chance"], "gain"].abs().max()
+
+
+def combinations(points: pd.DataFrame) -> list[Design]:
     """Pairs, then triples and more, of the levels that gained most for their time, the best first.
 
     Levels count that gain more than chance does, and those that nothing beats, for they save time.
 
     Args:
-        alone: a row a level that was tried alone: ``level``; ``gain``, dB over the base; ``ratio``, training
-            time over the base's. The first row is the base, of level None.
-        noise: the gain in dB that chance has; NaN where it is not known.
+        points: the base and what was tried so far: ``design``; ``gain``, dB over the base; ``times``,
+            training time over the base's; ``chance``, true of another seed.
     """
-    alone = alone[alone["gain"].notna() & alone["ratio"].notna()]
-    least = noise if math.isfinite(noise) else 0.0
-    unbeaten = alone.index.isin(frontier(alone["ratio"], alone["gain"]))
-    kept = alone[((alone["gain"] > least) | unbeaten) & alone["level"].notna()]
-    worth = [gain_for_time(row.gain, row.ratio) for row in kept.itertuples()]
-    best = kept["level"].iloc[pd.Series(worth, dtype=float).argsort(kind="stable")[::-1]][:MOST_COMBINED]
+    noise = noise_of(points)
+    alone = points[~points["chance"] & points["design"].map(len).le(1)].dropna(subset=["gain", "times"])
+    unbeaten = alone.index.isin(frontier(alone["times"], alone["gain"]))
+    gaining = alone["gain"] > (noise if math.isfinite(noise) else 0.0)
+    kept = alone[(gaining | unbeaten) & alone["design"].map(bool)]
+    best = kept["design"][worth_of(kept).sort_values(kind="stable").index[::-1]][:MOST_COMBINED]
     return [
-        design
+        tuple(levels)
         for size in range(2, MOST_COMBINED + 1)
-        for design in itertools.combinations(best, size)
-        if len({level.parameter for level in design}) == size
+        for levels in itertools.combinations(itertools.chain(*best), size)
+        if len({level.parameter for level in levels}) == size
     ]
 
 
-def gain_for_time(gain: float, ratio: float) -> float:
+def worth_of(points: pd.DataFrame) -> pd.Series:
     """Quality gained for each e-fold of training time; a loss counts as it is.
 
     Args:
-        gain: dB over the base.
-        ratio: training time over the base's.
+        points: ``gain``, dB over the base; ``times``, training time over the base's.
     """
-    return gain / math.log(max(ratio, 1.02)) if gain > 0 else gain
+    worth = points["gain"] / np.log(points["times"].clip(lower=1.02))
+    return worth.where(points["gain"] > 0, points["gain"])
 
 
-def frontier(costs: pd.Series, qualities: pd.Series) -> Sequence[Any]:
+def frontier(costs: pd.Series, qualities: pd.Series) -> list[Any]:
     """The labels of the points that no other dominates, the cheapest first.
 
     A point dominates another if it costs no more and is no worse, and one of the two is strict. Of points

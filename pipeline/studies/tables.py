@@ -34,11 +34,10 @@ class Metric:
         """A number as it is shown."""
         return f"{self.factor * value:,.{self.digits}f}" if math.isfinite(value) else NOTHING
 
-    def best(self, values: pd.Series) -> str | None:
-        """The best number's text, for what looks equal is equally good; None if neither end is better."""
-        if not self.better or values.count() < 2:
-            return None
-        return self.text(values.max() if self.better == "higher" else values.min())
+    def best(self, values: pd.Series) -> pd.Series:
+        """Whether each number is the best of two or more; what looks equal is equally good."""
+        end = {"higher": values.max(), "lower": values.min()}.get(self.better, math.nan)
+        return values.map(self.text).eq(self.text(end)) & values.notna() & (values.count() > 1)
 
 
 IMAGE = {
@@ -106,33 +105,31 @@ class Table:
     @property
     def texts(self) -> pd.DataFrame:
         """The numbers as they are shown, under their heads."""
-        return pd.DataFrame({
-            self.head(name): values.map(METRICS[name.split()[-1]].text)
-            for name, values in self.numbers.items()
-        })  # fmt: skip
-
-    def head(self, name: str) -> str:
-        """A column's label with its arrow, and with the source where that is the paper."""
-        source, _, key = name.rpartition(" ")
-        arrow = {"higher": " ↑", "lower": " ↓"}.get(METRICS[key].better, "") if self.ranked else ""
-        return f"{f'{source}: ' if source else ''}{METRICS[key].label}{arrow}"
+        return self.numbers.apply(lambda column: column.map(_metric(column.name).text)).rename(
+            columns=self.head
+        )
 
     @property
     def best(self) -> pd.DataFrame:
         """Whether each number is its column's best; of the shape of ``texts``."""
-        texts = self.texts
-        best = [METRICS[n.split()[-1]].best(v) if self.ranked else None for n, v in self.numbers.items()]
-        return pd.DataFrame({head: texts[head] == one for head, one in zip(texts, best, strict=True)})
+        best = self.numbers.apply(lambda column: _metric(column.name).best(column) & self.ranked)
+        return best.rename(columns=self.head)
+
+    def head(self, name: str) -> str:
+        """A column's label with its arrow, and with the source where that is the paper."""
+        source, metric = name.rpartition(" ")[0], _metric(name)
+        arrow = {"higher": " ↑", "lower": " ↓"}.get(metric.better, "") if self.ranked else ""
+        return f"{f'{source}: ' if source else ''}{metric.label}{arrow}"
 
     @property
     def notes(self) -> list[str]:
         """A note a row, empty where there is none."""
-        return self.rows[NOTE].fillna("").tolist() if NOTE in self.rows else [""] * len(self.rows)
+        return self.rows.get(NOTE, pd.Series("", self.rows.index)).fillna("").tolist()
 
     @property
     def main(self) -> list[bool]:
         """Whether each row stands out."""
-        return self.rows[MAIN].eq(True).tolist() if MAIN in self.rows else [False] * len(self.rows)
+        return self.rows.get(MAIN, pd.Series(False, self.rows.index)).eq(True).tolist()
 
     def values(self, subject: str) -> pd.DataFrame:
         """A row a finite number: ``table``, ``row``, ``subject``, ``metric``, ``source``, ``value``."""
@@ -146,16 +143,24 @@ class Table:
         })  # fmt: skip
 
 
+def _metric(name: str) -> Metric:
+    """The metric of a column, whoever measured it."""
+    return METRICS[name.split()[-1]]
+
+
 def markdown(table: Table) -> str:
     """The table as GitHub's Markdown, title and caption first."""
-    shown = table.texts.where(~table.best, "**" + table.texts + "**")
-    shown.insert(
-        0, table.first, [f"**{x}**" if m else x for x, m in zip(shown.index, table.main, strict=True)]
-    )
+    shown = table.texts.mask(table.best, "**" + table.texts + "**")
+    labels = [f"**{label}**" if main else label for label, main in zip(shown.index, table.main, strict=True)]
+    shown.insert(0, table.first, labels)
     if any(table.notes):
         shown[NOTE] = table.notes
     above = "\n\n".join(filter(None, (f"### {table.title}", table.caption)))
     return f"{above}\n\n{pipe_table(shown)}\n"
+
+
+MARKDOWN = str.maketrans({"\\": "\\\\", "|": "\\|", "\n": " "})
+"""The letters that would end a cell."""
 
 
 def pipe_table(texts: pd.DataFrame, numbers: str = "right") -> str:
@@ -165,13 +170,9 @@ def pipe_table(texts: pd.DataFrame, numbers: str = "right") -> str:
         texts: of the cells.
         numbers: where the other columns lie.
     """
-    texts = texts.map(_in_a_cell).rename(columns=_in_a_cell)
     align = ["left" if place == 0 or name == NOTE else numbers for place, name in enumerate(texts)]
-    return texts.to_markdown(index=False, disable_numparse=True, colalign=align)
-
-
-def _in_a_cell(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")
+    escaped = texts.map(lambda text: text.translate(MARKDOWN)).rename(columns=lambda n: n.translate(MARKDOWN))
+    return escaped.to_markdown(index=False, disable_numparse=True, colalign=align)
 
 
 LATEX = str.maketrans({
@@ -185,12 +186,12 @@ LATEX = str.maketrans({
 
 def latex(table: Table) -> str:
     """The table for LaTeX with booktabs; notes stand below it."""
+
+    def escape(text: str) -> str:
+        return text.translate(LATEX)
+
     bold = "textbf:--rwrap;"
-    shown = table.texts.map(lambda text: text.translate(LATEX))
-    shown = shown.rename(
-        columns=lambda head: head.translate(LATEX), index=lambda label: label.translate(LATEX)
-    )
-    best = pd.DataFrame(table.best.to_numpy(), shown.index, shown.columns)
+    shown, best = (one.rename(columns=escape, index=escape) for one in (table.texts.map(escape), table.best))
     styled = shown.style.apply(lambda _: best.map({True: bold, False: ""}.get), axis=None)
     styled = styled.apply_index(lambda _: [bold if main else "" for main in table.main])
     text = styled.to_latex(
@@ -198,13 +199,12 @@ def latex(table: Table) -> str:
         position="t",
         position_float="centering",
         column_format="l" + "r" * len(shown.columns),
-        caption=f"{table.title}. {table.caption}".translate(LATEX),
+        caption=escape(f"{table.title}. {table.caption}"),
         label=f"tab:{table.name}",
     )
     notes = [
-        rf"\par\smallskip {{\footnotesize {f'{label}: {note}'.translate(LATEX)}.}}"
+        rf"\par\smallskip {{\footnotesize {escape(f'{label}: {note}')}.}}"
         for label, note in zip(table.rows.index, table.notes, strict=True)
         if note
     ]
-    end = r"\end{table}"
-    return text.replace(end, "\n".join([*notes, end]))
+    return text.replace(r"\end{table}", "\n".join([*notes, r"\end{table}"]))

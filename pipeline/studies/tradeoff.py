@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from pipeline.clip.curves import read_curve
@@ -15,41 +14,31 @@ from pipeline.config.request import Request
 from pipeline.errors import UserError
 from pipeline.run.job import Job
 from pipeline.studies.fit_error import fit_numbers, fit_steps
-from pipeline.studies.measure import AvatarMeter, Numbers
+from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import curves, scatter
-from pipeline.studies.report import (
-    Page,
-    Picture,
-    Section,
-    publish,
-    settings_section,
-    sizes_of,
-    timings_section,
-)
-from pipeline.studies.search import TRAIN, Search, seconds_of, spoken, training_cost
+from pipeline.studies.report import Page, Picture, Section, closing_sections, publish, sizes_of, study_folder
+from pipeline.studies.search import Run, Search, point_table, seconds_of, spoken
 from pipeline.studies.sweep import (
-    CHANCE,
     GAUSSIANS,
     PRECISION,
-    Design,
+    REPRESENTATION,
     Level,
     combinations,
     frontier,
-    gain_for_time,
+    noise_of,
     overrides_of,
-    shortfalls,
+    setting_of,
     sweep_levels,
+    worth_of,
 )
 from pipeline.studies.tables import MAIN, NOTE, Table
-from pipeline.studies.variants import Base, Result, Variant, base_of, run_record, study_folder
+from pipeline.studies.variants import Base, Result, Settings, Variant, base_of, run_record
 
 DEFAULT_BUDGET = "20m"
-Run = tuple[Result, Design | None, str]
-"""A result, its design (None for a preset), and the preset that it is (empty if none)."""
-COLUMNS = (
+COLUMNS = [
     "gaussians", "psnr", "psnr_interior", "ssim", "lpips_alex", "train_s", "times", "gain", "whole_s",
     "animation_ms", "rendering_ms", "short",
-)  # fmt: skip
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,10 +47,8 @@ class Tradeoff:
 
     Attributes:
         base: whose avatar, and the study's own settings.
-        points: indexed by number, in the order of their making; 1 is the base. A column for each of
-            ``COLUMNS``: quality over the base's held-out frames at the base's picture size, processor
-            seconds, milliseconds. And ``result``; ``design``, None for a preset; ``preset``, which it is,
-            empty if none; ``label``; ``chance``, true of another seed, which is no choice.
+        points: as ``point_table`` gives them; 1 is the base. Quality is that of the base's held-out frames
+            at the base's picture size.
         expected: preset -> expected training cost, of those that were not run.
         fits: indexed by steps, with the columns of ``fit_numbers``.
         budget, seconds: allowed, and taken by this call.
@@ -82,12 +69,12 @@ class Tradeoff:
     @property
     def noise(self) -> float:
         """How far another seed's PSNR is off; NaN where it was not reached."""
-        return self.points.loc[self.points["chance"], "gain"].abs().max()
+        return noise_of(self.points)
 
     def frontier(self, cost: str = "train_s", metric: str = "psnr") -> list[int]:
         """The numbers of the points that nothing beats, the cheapest first."""
         sign = -1 if metric.startswith("lpips") else 1
-        return list(frontier(self.choices[cost], sign * self.choices[metric]))
+        return frontier(self.choices[cost], sign * self.choices[metric])
 
 
 def tradeoff(subject: str, request: Request) -> Path:
@@ -100,35 +87,29 @@ def tradeoff(subject: str, request: Request) -> Path:
         UserError: a setting is wrong, or the base itself failed.
     """
     text = request.budget or DEFAULT_BUDGET
-    budget, folder = seconds_of(text), study_folder(request, "tradeoff", subject)
+    budget, folder = seconds_of(text), study_folder(request.workspace.data, "tradeoff", subject)
     base = base_of(subject, request, folder / "log.txt")
     levels = sweep_levels(base.settings)
     print(f"tradeoff of {subject}: {len(levels)} levels alone, then what combines, within {text}", flush=True)
     meters: list[AvatarMeter] = []
 
-    def quality(result: Result) -> Numbers:
-        if not meters:  # the first result is the base's
+    def measure(result: Result) -> Result:
+        if not meters and not result.failure:  # the first result is the base's
             meters.append(AvatarMeter(base.job(), result.folders["ingest"]))
-        return meters[0].quality(result)
+        return meters[0].measured(result) if meters else result
 
-    search = Search(base, budget, lambda result: quality(result).get("psnr", math.nan))
+    search = Search(base, budget, measure)
     own = search.make(())
     if own.failure:
         raise UserError(own.failure)
     fits = run_fits(search)
     search.make_affordable((level,) for level in levels)
     presets, expected = run_presets(search, levels)
-    search.make_affordable(combinations(search.alone(), search.noise))
+    search.make_affordable(combinations(search.points()))
 
-    runs: list[Run] = [
-        (result, design, "" if design else base.preset) for design, result in search.results.items()
-    ]
+    runs: list[Run] = [(one, design, "" if design else base.preset) for design, one in search.results.items()]
     runs += [(result, None, preset) for preset, result in presets.items()]
-    done = [result for result, _, _ in runs if not result.failure]
-    print(f"timing {len(done)} avatars in motion", flush=True)
-    speeds = meters[0].speeds(done)
-    measured = [{} if one.failure else quality(one) | speeds[one.folders[TRAIN].name] for one, _, _ in runs]
-    points = point_table(runs, measured)
+    points = point_table(runs, meters[0].speeds(result for result, _, _ in runs))
     write_tradeoff(folder, Tradeoff(base, points, expected, fits, budget, search.spent))
     return folder
 
@@ -159,10 +140,10 @@ def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Resu
     for path in sorted((search.base.request.workspace.data / "presets").glob("*.toml")):
         base = search.base.under_preset(path.stem)
         expected[path.stem] = expected_cost(search, base.job(), levels)
-        seconds = expected[path.stem] * sum(own.seconds.values()) / max(training_cost(own), 1e-9)
-        if base.missing(TRAIN, {}) and seconds > (search.budget - search.spent) / 2:
+        seconds = expected[path.stem] * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
+        if base.missing("train", {}) and seconds > (search.budget - search.spent) / 2:
             continue
-        result, _ = search.run(base, Variant(f"preset {path.stem}"))
+        result = search.run(base, Variant(f"preset {path.stem}"))
         if not result.failure:
             results[path.stem] = result
             del expected[path.stem]
@@ -172,42 +153,25 @@ def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Resu
 def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
     """Processor seconds that training under a job's settings would cost, from the levels tried alone.
 
-    Iterations count in proportion, levels of subdivision and precision by what they were found to cost.
+    Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
     """
     own, wanted, result = search.base.settings["train"], job.settings["train"], search.results[()]
-    cost = training_cost(result)
-    marks = run_record(result.folders[TRAIN])["timings"].get("curve_seconds") or [(0, 0.0, cost)]
-    iterating = float(marks[-1][2])  # the rest is spent before and after the iterations
-    cost += iterating * (wanted.iterations / own.iterations - 1)
-    fields = {GAUSSIANS: "subdivisions", PRECISION: "half_precision"}
+    cost = result.training_cost
+    marks = run_record(result.folders["train"])["timings"].get("curve_seconds") or [(1, 0.0, cost)]
+    done, iterating = float(marks[-1][0]), float(marks[-1][2])  # the rest is spent before and after the steps
+    planned = done / own.effort if not own.iterations else done
+    cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
     for level in levels:
-        field = fields.get(level.parameter, "")
-        if field and dict(level.overrides)[f"train.{field}"] == str(getattr(wanted, field)).lower():
-            cost *= search.cost_ratio(level) if getattr(wanted, field) != getattr(own, field) else 1.0
+        if level.parameter not in (GAUSSIANS, PRECISION, REPRESENTATION):
+            continue
+        if all(_text(job.settings, name) == text for name, text in level.overrides):
+            cost *= search.cost_ratio(level)
     return cost
 
 
-def point_table(runs: Sequence[Run], measured: Sequence[Mapping[str, float]]) -> pd.DataFrame:
-    """The points, as ``Tradeoff`` describes them.
-
-    Args:
-        runs: result, design and preset of each, the base's first.
-        measured: quality and speed of each; empty where it failed.
-    """
-    points = pd.DataFrame(measured, index=range(1, len(runs) + 1))
-    points = points.reindex(columns=COLUMNS).astype(float)
-    points["result"], points["design"], points["preset"] = (
-        pd.Series(list(values), points.index, dtype=object) for values in zip(*runs, strict=True)
-    )
-    points["train_s"] = points["result"].map(training_cost).astype(float)
-    points["whole_s"] = [pd.Series(r.cpu_seconds, dtype=float).sum(min_count=1) for r in points["result"]]
-    points["times"] = points["train_s"] / points["train_s"].iloc[0]
-    points["gain"] = points["psnr"] - points["psnr"].iloc[0]
-    points["label"] = [result.variant for result in points["result"]]
-    points["chance"] = [bool(d) and d[0].parameter == CHANCE for d in points["design"]]
-    choices = points[~points["chance"]]
-    points["short"] = shortfalls(choices["train_s"], choices["psnr"])
-    return points
+def _text(settings: Settings, name: str) -> str:
+    """The value of a setting as a command line has it."""
+    return str(setting_of(settings, name)).lower()
 
 
 def numbered(points: pd.DataFrame) -> pd.DataFrame:
@@ -229,30 +193,24 @@ def write_tradeoff(folder: Path, study: Tradeoff) -> None:
         "another seed's difference mean nothing.",
         *([f"Failed: {', '.join(failed)}; the table says why."] if failed else []),
     ]
-    page = Page(
-        title=f"{study.base.subject}: what accuracy costs",
-        lead=headline(study),
-        lines=lines,
-        sections=[
-            Section("The frontier", frontier_lines(study), pictures=plots(folder, study)),
-            *(Section(table.title, tables=[table]) for table in tables),
-            settings_section(study.base.settings, changed),
-            timings_section(points["result"].to_dict(), study.seconds),
-        ],
-    )
-    publish(folder, page, tables, pd.concat([table.values(study.base.subject) for table in tables]))
+    sections = [
+        Section("The frontier", frontier_lines(study), pictures=plots(folder, study)),
+        *(Section(table.title, tables=[table]) for table in tables),
+        *closing_sections(study.base, changed, points["result"].to_dict(), study.seconds),
+    ]
+    page = Page(f"{study.base.subject}: what accuracy costs", headline(study), lines, sections)
+    publish(folder, page, pd.concat([table.values(study.base.subject) for table in tables]))
 
 
 def tables_of(study: Tradeoff) -> list[Table]:
     """The points, and the registrations."""
-    noise = study.noise
-    chance = f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
+    chance = f" Another seed differs by {study.noise:.2f} dB." if math.isfinite(study.noise) else ""
     caption = (
-        f"{sizes_of(study.base.settings)} Quality: means over held-out frames, all at the base's picture "
-        "size. Seconds are processor seconds of all threads, of the run that made the result; training "
-        "includes the views that were made for it, the whole job all up to training. Milliseconds: the baked "
-        "avatar on one thread, the least of 15 frames, drawn at 512×512. In bold letters: on the frontier of "
-        f"PSNR and training seconds.{chance}"
+        f"Sizes: {sizes_of(study.base.settings)}. Quality: means over held-out frames, all at the base's "
+        "picture size. Seconds are processor seconds of all threads, of the run that made the result; "
+        "training includes the views that were made for it, the whole job all up to training. Milliseconds: "
+        "the baked avatar on one thread, the least of 15 frames, drawn at 512×512. In bold letters: on the "
+        f"frontier of PSNR and training seconds.{chance}"
     )
     points = study.points
     failures = points["result"].map(lambda one: one.failure and f"failed: {one.failure}")
@@ -266,28 +224,32 @@ def tables_of(study: Tradeoff) -> list[Table]:
             "distance of the trusted keypoints from where they were detected; mm: of the joints that the "
             "camera sees from the truth, aligned at the neck."
         )
-        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps")
-        tables.append(
-            Table("fits", "What the fit's effort buys", told, fits.drop(columns="clock"), first="fit")
-        )
+        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps").drop(columns="clock")
+        tables.append(Table("fits", "What the fit's effort buys", told, fits, first="fit"))
     return tables
 
 
+TRAINING = "processor seconds of training, views included"
 PLOTS = (
-    # file, cost, metric, label of the costs, label of the metric
-    ("psnr_over_training", "train_s", "psnr", "processor seconds of training, views included", "PSNR, dB"),
+    # file, cost, metric, factor, label of the costs, label of the metric
+    ("psnr_over_training", "train_s", "psnr", 1, TRAINING, "PSNR, dB"),
+    ("lpips_over_training", "train_s", "lpips_alex", 100, TRAINING, "LPIPS×100"),
     (
-        "lpips_over_training",
-        "train_s",
-        "lpips_alex",
-        "processor seconds of training, views included",
-        "LPIPS×100",
+        "psnr_over_animation",
+        "animation_ms",
+        "psnr",
+        1,
+        "processor milliseconds to animate a frame",
+        "PSNR, dB",
     ),
-    ("psnr_over_animation", "animation_ms", "psnr", "processor milliseconds to animate a frame", "PSNR, dB"),
 )
 FIT_PLOTS = (
     ("fit_pixels", "pixels", "Reprojection error, px"),
     ("fit_millimetres", "millimetres", "Joints' distance from the truth, mm"),
+)
+CURVES = (
+    "Training curves of every run that learnt from the base's pictures; the frontier's in colour. "
+    "Wall-clock seconds carry what else the machine was doing."
 )
 
 
@@ -295,30 +257,25 @@ def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     """Draws every plot there is something for."""
     points = study.points.assign(base=study.points.index == 1)
     pictures = []
-    for name, cost, metric, across, up in PLOTS:
-        shown = points.assign(x=points[cost], y=points[metric] * (100 if metric == "lpips_alex" else 1))
+    for name, cost, metric, factor, across, up in PLOTS:
+        file, shown = folder / f"{name}.png", points.assign(x=points[cost], y=factor * points[metric])
         expected = study.expected if cost == "train_s" else {}
-        scatter(
-            folder / f"{name}.png", shown, study.frontier(cost, metric), across, f"held-out {up}", expected
-        )
+        scatter(file, shown, study.frontier(cost, metric), across, f"held-out {up}", expected)
         dashed = " Dashed: what a preset that was not run would cost, if near." if expected else ""
         told = f"Held-out {up.partition(',')[0]} against {across}. Numbers are the table's."
-        pictures.append((folder / f"{name}.png", told + dashed))
-    file, told = folder / "training_curves.png", (
-        "Training curves of every run that learnt from the base's pictures; the frontier's in colour. "
-        "Wall-clock seconds carry what else the machine was doing."
-    )  # fmt: skip
-    curves(
-        file, training_curves(study), "wall-clock seconds of training", "PSNR of a few held-out frames, dB"
-    )
-    pictures.append((file, told))
-    for name, error, up in FIT_PLOTS if len(study.fits) else ():
-        if study.fits[error].notna().any():
-            shown = study.fits.assign(x=study.fits["seconds"], y=study.fits[error])
-            edge = frontier(shown["x"], -shown["y"])
-            scatter(folder / f"{name}.png", shown, edge, "seconds of registration", up)
+        pictures.append((file, told + dashed))
+    file, up = folder / "training_curves.png", "PSNR of a few held-out frames, dB"
+    curves(file, training_curves(study), "wall-clock seconds of training", up)
+    pictures.append((file, CURVES))
+    for name, error, up in FIT_PLOTS:
+        if error in study.fits and study.fits[error].notna().any():
+            file, shown = (
+                folder / f"{name}.png",
+                study.fits.assign(x=study.fits["seconds"], y=study.fits[error]),
+            )
+            scatter(file, shown, frontier(shown["x"], -shown["y"]), "seconds of registration", up)
             told = f"{up.partition(',')[0]} against the registration's seconds; numbers are steps."
-            pictures.append((folder / f"{name}.png", told))
+            pictures.append((file, told))
     return pictures
 
 
@@ -332,7 +289,7 @@ def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
     results, lines = numbered(study.points.loc[order])["result"], {}
     for name, result in results.items():
         if result.folders.get("ingest") == results.iloc[0].folders["ingest"]:
-            train, remedy = result.folders[TRAIN], "run the train stage again"
+            train, remedy = result.folders["train"], "run the train stage again"
             seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"].get("curve_seconds", [])}
             line = read_curve(train / "curve.parquet", remedy).get("psnr", [])
             lines[name] = [(seconds[step], value) for step, value in line if step in seconds]
@@ -341,17 +298,16 @@ def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
 
 def frontier_lines(study: Tradeoff) -> list[str]:
     """The frontier in words, the cheapest first, and how far presets lie from it."""
-    points, edge = numbered(study.points), study.frontier()
+    points, edge = study.points, study.frontier()
     lines = [
         f"{name}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
-        for name, point in points.iloc[[number - 1 for number in edge]].iterrows()
+        for name, point in numbered(points.loc[edge]).iterrows()
     ]
-    for number, point in study.points[study.points["preset"].ne("")].iterrows():
+    for number, point in points[points["preset"].ne("")].iterrows():
         where = "on" if number in edge else f"{point['short']:.2f} dB under"
         lines.append(f"Preset {point['preset']} lies {where} the frontier.")
-    return lines + [
-        f"Preset {name} was not run: about {spoken(cost)}." for name, cost in study.expected.items()
-    ]
+    missing = study.expected.items()
+    return lines + [f"Preset {name} was not run: about {spoken(cost)}." for name, cost in missing]
 
 
 def headline(study: Tradeoff) -> str:
@@ -363,23 +319,22 @@ def headline(study: Tradeoff) -> str:
     noise = study.noise if math.isfinite(study.noise) else 0.05  # what would be told as 0.0
     gaining = levels[levels["gain"] > noise]
     if gaining.empty:
-        chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"
-        as_good = study.choices[study.choices["gain"] >= -noise].sort_values("train_s", kind="stable").iloc[0]
-        perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
-        instead = (
-            f"stay with {base['gaussians']:,.0f} Gaussians and {sizes_of(study.base.settings)}"
-            if as_good["times"] > 0.95
-            else f"{as_good['label']}, at {times(as_good)}, does as well in PSNR ({perceived})"
-        )
-        return f"No single change that was tried gains {chance}: {instead}."
-    worth = [gain_for_time(one.gain, one.times) for one in gaining.itertuples()]
-    best, most = gaining.iloc[int(np.argmax(worth))], gaining.loc[gaining["gain"].idxmax()]
-    more = (
-        ""
-        if most is best or most.name == best.name
-        else f"; the most is gained by going {change(most, base)}"
-    )
+        return f"No single change that was tried gains {idle_change(study, noise)}."
+    best, most = gaining.loc[worth_of(gaining).idxmax()], gaining.loc[gaining["gain"].idxmax()]
+    more = f"; the most is gained by going {change(most, base)}" if most.name != best.name else ""
     return f"Going {change(best, base)}{more}."
+
+
+def idle_change(study: Tradeoff, noise: float) -> str:
+    """What to do where no level gains: the cheapest choice that is as good as the base."""
+    base = study.points.loc[1]
+    chance = f"more than another seed does ({noise:.1f} dB)" if math.isfinite(study.noise) else "anything"
+    as_good = study.choices[study.choices["gain"] >= -noise].sort_values("train_s", kind="stable").iloc[0]
+    if as_good["times"] > 0.95:
+        sizes = sizes_of(study.base.settings)
+        return f"{chance}: stay with {base['gaussians']:,.0f} Gaussians and {sizes}"
+    perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
+    return f"{chance}: {as_good['label']}, at {times(as_good)}, does as well in PSNR ({perceived})"
 
 
 def change(point: pd.Series, base: pd.Series) -> str:

@@ -24,11 +24,12 @@ from pipeline.store.artifact import RUN
 Overrides = Mapping[str, str]
 """Setting's name -> text, as on the command line."""
 
-SUMMARY = "summary.json"  # what the evaluate stage publishes its means in
+Settings = Mapping[str, Any]
+"""Stage -> its settings."""
 
 SCALES: Mapping[str, Overrides] = {
     "preset": {},
-    "small": {"train.iterations": "200", "train.subdivisions": "0"},
+    "small": {"train.iterations": "200", "train.subdivisions": "0", "plan.edge_pixels": "5"},
 }
 """``scale=`` -> its overrides; those of the command line win over them."""
 
@@ -47,15 +48,15 @@ LEAN = {
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One row of a study.
-
-    Attributes:
-        name: for the tables.
-        overrides: settings that differ from the study's base.
-    """
+    """One row of a study: its name in tables, and the settings that differ from the study's base."""
 
     name: str
     overrides: Overrides = dataclasses.field(default_factory=dict)
+
+
+def another_seed(settings: Settings) -> Variant:
+    """The variant that shows what chance is worth: the base, trained with the next seed."""
+    return Variant("another seed", {"train.seed": str(settings["train"].seed + 1)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +67,7 @@ class Result:
         subject: whose avatar.
         variant: its name.
         failure: the reason in a line; empty where it did not fail. Then all below is empty.
-        means: split -> method -> metric -> mean over frames, as in summary.json; empty without evaluate.
-        gaussians: of the avatar; 0 without evaluate.
+        means: method -> metric -> mean over the held-out frames, None where it has none.
         seconds: stage -> wall-clock seconds of the run that made its version.
         cpu_seconds: stage -> processor seconds of all threads of it, less what compiling took.
         folders: stage -> where its version lies.
@@ -76,25 +76,31 @@ class Result:
     subject: str
     variant: str
     failure: str = ""
-    means: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    gaussians: int = 0
+    means: Mapping[str, Mapping[str, float | None]] = dataclasses.field(default_factory=dict)
     seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     cpu_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     folders: Mapping[str, Path] = dataclasses.field(default_factory=dict)
 
     def held_out(self, method: str = "avatar") -> dict[str, float]:
         """Metric -> mean over the held-out frames, of the metrics that have one."""
-        means = self.means.get("test", {}).get(method, {})
-        return {metric: float(value) for metric, value in means.items() if value is not None}
+        return {metric: value for metric, value in self.means.get(method, {}).items() if value is not None}
+
+    @property
+    def psnr(self) -> float:
+        """The avatar's, dB; NaN where it was not measured."""
+        return self.held_out().get("psnr", math.nan)
+
+    @property
+    def training_cost(self) -> float:
+        """Processor seconds of training and of the views made for it; NaN of a failure."""
+        stages = ("train", "auxiliary")
+        return math.nan if self.failure else sum(self.cpu_seconds.get(stage, 0.0) for stage in stages)
 
     @property
     def line(self) -> str:
         """One line for the terminal."""
-        if self.failure:
-            return f"{self.subject}, {self.variant}: failed: {self.failure}"
-        psnr, seconds = self.held_out().get("psnr", math.nan), self.cpu_seconds.get("train", math.nan)
-        numbers = f"{psnr:.2f} dB, {self.gaussians:,} Gaussians, trained in {seconds:.0f} processor seconds"
-        return f"{self.subject}, {self.variant}: {numbers}"
+        done = f"{self.psnr:.2f} dB, trained in {self.training_cost:.0f} processor seconds"
+        return f"{self.subject}, {self.variant}: {f'failed: {self.failure}' if self.failure else done}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,8 +124,8 @@ class Base:
         return open_job(self.subject, self.request.override(overrides or {}))
 
     @functools.cached_property
-    def settings(self) -> Mapping[str, Any]:
-        """Stage -> settings of the base itself."""
+    def settings(self) -> Settings:
+        """The base's own."""
         return self.job().settings
 
     def missing(self, stage: str, overrides: Overrides) -> list[str]:
@@ -144,7 +150,7 @@ class Base:
     def under_preset(self, preset: str) -> Base:
         """The same subject and places under a preset's own settings."""
         request = dataclasses.replace(self.request, preset=preset, overrides={})
-        return Base(self.subject, request, self.log, preset)
+        return dataclasses.replace(self, request=request, preset=preset)
 
 
 def base_of(subject: str, request: Request, log: Path, defaults: Overrides | None = None) -> Base:
@@ -163,8 +169,9 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
-    if train is not None and hasattr(train, "held_out_every"):
-        lean["train.held_out_every"] = str(min(train.held_out_every, max(1, train.iterations // 10)))
+    if hasattr(train, "held_out_every"):
+        tenth = max(1, train.iterations // 10) if train.iterations else train.held_out_every
+        lean["train.held_out_every"] = str(min(train.held_out_every, tenth))
     changed = any(not name.startswith("evaluate.") for name in own)
     full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
     return Base(subject, full, log, "" if changed else request.preset)
@@ -177,33 +184,45 @@ def scale_overrides(request: Request) -> Overrides:
     return SCALES[request.scale]
 
 
-def study_folder(request: Request, kind: str, name: str) -> Path:
-    """The folder for a study's tables, plots and page; it is made."""
-    folder = request.workspace.data / "studies" / kind / name
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
 def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Result:
     """The scores and times that published versions hold.
 
     Args:
         subject, variant: names for the tables.
         folders: stage -> its version.
+
+    Raises:
+        UserError: evaluate's file is damaged.
     """
     records = {stage: run_record(folder) for stage, folder in folders.items()}
-    summary: dict[str, Any] = {"means": {}, "gaussians": 0}
-    if "evaluate" in folders:
-        summary = json.loads((folders["evaluate"] / SUMMARY).read_text(encoding="utf-8"))
     return Result(
-        subject=subject,
-        variant=variant,
-        means=summary["means"],
-        gaussians=summary["gaussians"],
+        subject,
+        variant,
+        means=held_out_means(read_summary(folders["evaluate"])) if "evaluate" in folders else {},
         seconds={stage: record["seconds"] for stage, record in records.items()},
         cpu_seconds={stage: cpu_seconds(record) for stage, record in records.items()},
         folders=folders,
     )
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """``summary.json`` of a version of evaluate: its ``means``, and the choices that they depend on.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    path = folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        dict(summary["means"].get("test", {}))
+        return summary
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
+
+
+def held_out_means(summary: Mapping[str, Any]) -> Mapping[str, Mapping[str, float | None]]:
+    """Method -> metric -> mean over the held-out frames; empty where none are held out."""
+    return summary["means"].get("test", {})
 
 
 def run_record(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pipeline.config.settings import Layer
 from pipeline.config.subjects import load_subject
 from pipeline.config.workspace import open_workspace
 from pipeline.errors import UserError
-from pipeline.studies.compare import comparison, wanted
+from pipeline.studies.compare import Measured, comparison, wanted
 
 
 @pytest.fixture
@@ -105,9 +105,8 @@ def test_compare_puts_published_rows_beside_ours(many):
 def test_the_row_of_the_datasets_own_protocol_is_marked():
     means = {"avatar": {"psnr": 20.0, "ssim": 0.9, "lpips_alex": 0.1}}
     refined = {**means, "avatar_refined": {"psnr": 25.0, "ssim": 0.9, "lpips_alex": 0.1}}
-    white = {"protocol": "white", "background": "white", "render_mask": "truth", "current": True}
-    black = {"protocol": "black", "background": "black", "render_mask": "own", "current": False}
-    found = {"a": {"means": refined, **white}, "b": {"means": means, **black}}
+    white = Measured(refined, "white", background="white", render_mask="truth")
+    found = {"a": white, "b": Measured(means, "black", current=False)}
     rows = (Row("T", {"b": (1.0, 2.0, 3.0)}),)
     as_neuman = Layer("x", {"evaluate": {"protocol": "paper"}})
     text = comparison(Dataset("x", "X", "", "theirs", as_neuman, "", rows), ["a", "b"], found)
@@ -134,9 +133,7 @@ def test_neuman_is_judged_as_its_paper_does():
 def test_a_dataset_without_published_numbers_has_a_table_too():
     about = Dataset("x", "X", "", "", Layer("x", {}), "", ())
     means = {"avatar": {"psnr": 20.0, "ssim": None, "lpips_alex": None}}
-    found = {
-        "a": {"means": means, "protocol": "", "background": "black", "render_mask": "own", "current": True}
-    }
+    found = {"a": Measured(means)}
     shown = rows_of(comparison(about, ["a", "b"], found))
     assert shown["method"] == ["a", "mean"] and shown["**here** (1 of 2 subjects)"][0] == "20.00 / - / -"
     with_rows = Dataset("x", "X", "", "", Layer("x", {}), "", (Row("T", {"b": (1.0, 2.0, 3.0)}),))

@@ -140,9 +140,10 @@ def test_every_level_can_be_set_and_changes_something(subject, preset):
     base = open_job(subject, parse_request({"preset": preset}, subject))
     levels = sweep_levels(base.settings)
     parameters = [level.parameter for level in levels]
-    assert {"iterations", "number of Gaussians", "image size", "fit effort", "precision", "LPIPS"} <= {
+    assert {"steps", "number of Gaussians", "image size", "fit effort", "representation", "LPIPS"} <= {
         *parameters
     }
+    assert ("precision" in parameters) == (preset == "paper")  # the heads of a triplane have one
     assert parameters.count(CHANCE) == 1
     firsts = len(dict.fromkeys(parameters))
     assert len(set(parameters[:firsts])) == firsts  # each parameter's first level before any second one
@@ -181,10 +182,21 @@ def test_a_size_is_asked_for_where_ingest_takes_it_from(subject, overrides):
     ],
 )
 def test_the_number_of_gaussians_is_varied_whatever_the_plan_says(words, own, others):
-    levels = levels_of("number of Gaussians", **words)
+    levels = levels_of("number of Gaussians", **{"train.representation": "triplane", **words})
     assert {level.before for level in levels} == {own}
     assert "".join(dict(level.overrides)["train.subdivisions"] for level in levels) == others
     assert all(dict(level.overrides)["plan.subdivision"] == "on" for level in levels)
+
+
+def test_the_density_of_bases_is_varied_by_their_longest_edge():
+    levels = levels_of("number of Gaussians", **{"plan.edge_pixels": "4"})
+    assert [dict(level.overrides)["plan.edge_pixels"] for level in levels] == ["6", "2.8"]
+    assert levels[0].factor < 1 < levels[1].factor  # the coarser mesh first: it is the faster
+
+
+def test_steps_are_varied_by_what_decides_them():
+    assert dict(levels_of("steps")[0].overrides) == {"train.effort": "0.5"}
+    assert dict(levels_of("steps", **{"train.iterations": "300"})[0].overrides) == {"train.iterations": "150"}
 
 
 def test_a_part_is_left_out_where_it_is_and_added_where_it_can_be():

@@ -43,6 +43,8 @@ TINY = TrainSettings(
     gate_every=2,
     residual_from=0.3,
     face=0.8,
+    lpips=0.0,
+    lpips_from=0.0,
 )
 
 

@@ -1,5 +1,6 @@
 """Frontiers, the order of a tradeoff's designs, and which of them are made within its budget."""
 
+import dataclasses
 import math
 
 import pandas as pd
@@ -14,6 +15,7 @@ from pipeline.studies.sweep import (
     combinations,
     frontier,
     label_of,
+    noise_of,
     overrides_of,
     shortfalls,
 )
@@ -108,14 +110,18 @@ class World:
         return Result("ann", variant.name, seconds=seconds, cpu_seconds=seconds, means={"design": design})
 
     def search(self, budget, most=None):
-        found = Search(
-            self, budget, lambda r: 30 + sum(map(self.gains.get, r.means["design"])), lambda: self.now
-        )
+        found = Search(self, budget, self.measure, lambda: self.now)
         found.make(())
         found.make_affordable([(one,) for one in LEVELS][:most])
         if most is None:
-            found.make_affordable(combinations(found.alone(), found.noise))
+            found.make_affordable(combinations(found.points()))
         return found
+
+    def measure(self, result):
+        if result.failure:
+            return result
+        psnr = 30 + sum(map(self.gains.get, result.means["design"]))
+        return dataclasses.replace(result, means={"avatar": {"psnr": psnr}})
 
 
 FACTOR, GAIN = st.floats(0.3, 4.0), st.floats(-2, 2)
@@ -158,7 +164,7 @@ def test_an_interrupted_study_goes_on_as_it_would_have(factors, gains, cut):
 
 def test_measured_costs_replace_the_guesses():
     world = World((0.9, 0.5, 1, 6.0, 2.0), (0, -1, 0, 1, 1))
-    search = Search(world, 1e9, lambda result: 30.0, lambda: world.now)
+    search = Search(world, 1e9, world.measure, lambda: world.now)
     search.make(())
     assert search.expected_seconds((LARGE,)) == pytest.approx(300)
     search.make((LARGE,))
@@ -171,26 +177,27 @@ def test_a_combination_of_two_good_levels_is_found_and_the_best_for_its_time_com
     search = World((0.9, 0.5, 1, 1.5, 2), (-0.5, -1, 0.1, 1, 1)).search(1e9)
     designs = [design for design in search.results if len(design) > 1]
     assert designs[0] == (LARGE, DOUBLE)  # 1 dB each, the other way round would be dearer for its gain
-    assert max(search.psnr.values()) == search.psnr[LARGE, DOUBLE] == pytest.approx(32)
-    assert search.noise == pytest.approx(0.1)
+    assert search.points()["psnr"].max() == search.results[LARGE, DOUBLE].psnr == pytest.approx(32)
+    assert noise_of(search.points()) == pytest.approx(0.1)
 
 
 def test_levels_that_gain_less_than_chance_and_are_beaten_are_not_combined():
     search = World((1.2, 1.3, 1, 1.5, 2), (0.09, -1, 0.1, 0.08, 1)).search(1e9)
 
-    def combined(noise):
-        return {one for design in combinations(search.alone(), noise) for one in design}
+    def combined(points):
+        return {one for design in combinations(points) for one in design}
 
-    assert search.noise == pytest.approx(0.1) and combined(search.noise) == {WITHOUT, DOUBLE}
-    assert combined(math.nan) == {WITHOUT, LARGE, DOUBLE}  # no other seed was reached
-    assert combinations(search.alone().iloc[:1], math.nan) == []
+    points = search.points()
+    assert noise_of(points) == pytest.approx(0.1) and combined(points) == {WITHOUT, DOUBLE}
+    assert combined(points[~points["chance"]]) == {WITHOUT, LARGE, DOUBLE}  # no other seed was reached
+    assert combinations(points.iloc[:1]) == []
 
 
 def test_failed_designs_are_tried_once_and_lead_nowhere():
     world = World((0.9, 0.5, 1, 1.5, 2), (0.5, -1, 0.1, 1, 1), failing=[LARGE])
     search = world.search(1e9)
     assert [design for design in search.results if LARGE in design] == [(LARGE,)]
-    assert math.isnan(search.psnr[(LARGE,)]) and len(search.results) > 1 + len(LEVELS)
+    assert math.isnan(search.results[(LARGE,)].psnr) and len(search.results) > 1 + len(LEVELS)
 
 
 def test_what_the_store_holds_is_taken_up_when_the_budget_is_spent():

@@ -23,20 +23,19 @@ from pipeline.studies.ablation import (
     FULL,
     SAME,
     VARIANTS,
-    Ablation,
     counts_refined,
     headline,
-    score_table,
     tables_of,
     values_of,
     write_ablation,
 )
 from pipeline.studies.fit_error import aligned_error
 from pipeline.studies.plots import bars, curves, round_ticks, scatter
+from pipeline.studies.search import point_table
 from pipeline.studies.sweep import CHANCE as CHANCE_PARAMETER
 from pipeline.studies.sweep import Level, label_of
 from pipeline.studies.tables import LATEX, MAIN, NOTE, Table, latex, markdown
-from pipeline.studies.tradeoff import Tradeoff, plots, point_table, write_tradeoff
+from pipeline.studies.tradeoff import Tradeoff, plots, write_tradeoff
 from pipeline.studies.tradeoff import headline as pays
 from pipeline.studies.tradeoff import tables_of as points_of
 from pipeline.studies.variants import Result, base_of
@@ -106,17 +105,18 @@ def result(folder, variant, subject="smile", psnr=30.0, avatar="a", seconds=20.0
     for stage in ("ingest", "fit", "auxiliary", "train", "evaluate"):
         folders[stage] = folder / f"{stage}_{subject}_{variant}" if stage == "train" else folder / stage
         folders[stage].mkdir(parents=True, exist_ok=True)
-        files = [{"path": "avatar.safetensors", "sha256": avatar}]
-        (folders[stage] / "manifest.json").write_text(json.dumps({"version": 1, "files": files}))
+        files = [{"path": "avatar.safetensors", "sha256": avatar, "size": 1}]
+        manifest = {"version": 1, "key": "k", "files": files}
+        (folders[stage] / "manifest.json").write_text(json.dumps(manifest))
     timings = {"curve_seconds": [[10, 2.0, 2.0], [20, 4.5, 4.4]]}
     (folders["train"] / "run.json").write_text(json.dumps({"cores": 2, "machine": "x", "timings": timings}))
     line = {"iteration": np.array([10, 20], np.int32), "name": np.array(["psnr"] * 2, object)}
     write_table(
         folders["train"] / "curve.parquet", SCHEMA, line | {"value": np.array([psnr - 2, psnr], np.float32)}
     )
-    means = {"test": {"avatar": {"psnr": psnr, "ssim": 0.9, "lpips_alex": 0.05, **metrics}}}
+    means = {"avatar": {"psnr": psnr, "ssim": 0.9, "lpips_alex": 0.05, **metrics}}
     times = {"train": 1.2 * seconds}, {"train": seconds}
-    return Result(subject, variant, "", means, 5000, *times, folders)
+    return Result(subject, variant, "", means, *times, folders)
 
 
 SPEED = {"gaussians": 5000.0, "asset_mib": 0.27, "animation_ms": 20.0, "rendering_ms": 5.0}
@@ -137,9 +137,9 @@ def ablation_of(folder, subjects=("smile",), dataset="samples", failing=(), refi
                 )
             )
             if refined and not results[subject, key].failure:
-                results[subject, key].means["test"]["avatar_refined"] = refined
-    speeds = {one.folders["train"].name: SPEED for one in results.values() if not one.failure}
-    return Ablation(results, score_table(results, speeds, bool(refined)), dataset, bool(refined))
+                results[subject, key].means["avatar_refined"] = refined
+    speeds = {one.folders["train"]: SPEED for one in results.values() if not one.failure}
+    return ablation.Ablation(results, speeds, dataset, bool(refined))
 
 
 def by_name(found):
@@ -240,19 +240,21 @@ DESIGNS = (
 
 
 def tradeoff_of(folder, gains=(0.0, 2.0, 0.4, 0.1), costs=(20.0, 80.0, 30.0, 20.0)):
-    runs, measured = [], []
+    runs, speeds = [], {}
     for number, (design, gain, cost) in enumerate(zip(DESIGNS, gains, costs, strict=True), 1):
         one = result(folder, label_of(design), psnr=30 + gain, seconds=cost)
         runs.append((one, design, ""))
-        speed = {"gaussians": 5000.0, "animation_ms": 10.0 + number, "rendering_ms": 4.0}
-        measured.append(one.held_out() | speed)
+        speeds[one.folders["train"]] = {
+            "gaussians": 5000.0, "animation_ms": 10.0 + number, "rendering_ms": 4.0
+        }  # fmt: skip
     runs.append((Result("smile", "both", "no memory"), DESIGNS[1] + DESIGNS[2], ""))
-    runs.append((result(folder, "preset draft", psnr=28.0, seconds=10.0), None, "draft"))
-    measured += [{}, {"psnr": 28.0, "lpips_alex": 0.1}]
+    draft = result(folder, "preset draft", psnr=28.0, seconds=10.0)
+    means = {"avatar": {"psnr": 28.0, "lpips_alex": 0.1}}
+    runs.append((dataclasses.replace(draft, means=means), None, "draft"))
     fits = {"seconds": [1.0, 4.0], "clock": "processor", "pixels": [3.0, 2.0], "millimetres": [20.0, 12.0]}
     base = base_of("smile", parse_request({}), folder / "log.txt")
     fits = pd.DataFrame(fits, index=[10, 40])
-    return Tradeoff(base, point_table(runs, measured), {"balanced": 900.0}, fits, 60.0, 50.0)
+    return Tradeoff(base, point_table(runs, speeds), {"balanced": 900.0}, fits, 60.0, 50.0)
 
 
 def test_one_sentence_says_what_pays(tmp_path):
