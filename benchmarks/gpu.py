@@ -49,6 +49,7 @@ SMALL_MANNEQUIN = {"ingest.mannequin_frames": "24", "ingest.mannequin_views": ""
 ALL_FROM_THE_START = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "subdivide_from": 0.0,
     "half_precision": False,  # which a GPU rounds otherwise
+    "lpips": 0.0,  # plain torch on both
 }  # fmt: skip
 STEPS, QUICK_STEPS = 100, 5
 COUNTS, QUICK_COUNTS = (20_000, 84_000, 167_000), (5_000,)
