@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.frame import CLOCKS
-from pipeline.avatar import Architecture, Avatar
+from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.body import BodyModel, Pose, load_body, mean_identity, subdivide
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.config.workspace import REPOSITORY
@@ -71,6 +71,20 @@ def avatar_of(count: int, architecture: Architecture | None = None, half_precisi
     sizes = dataclasses.replace(architecture or Architecture(), subdivisions=level)
     avatar = Avatar(body, mean_identity(body), kept, sizes, half_precision=half_precision)
     _awaken(avatar)
+    return avatar
+
+
+def bases_avatar_of(count: int, bases: int = 8) -> Avatar:
+    """An avatar of as many Gaussians with parameters and linear bases of their own.
+
+    Args:
+        count: as for ``avatar_of``.
+        bases: K; driven by random poses.
+    """
+    avatar = avatar_of(count, Architecture(representation="bases", bases=bases))
+    poses = poses_of(avatar, 4 * bases, seed=3)
+    theta = torch.stack([pose_features(pose.rotation) for pose in poses])
+    avatar.representation.set_clip(ClipConditions(theta, torch.stack([pose.expression for pose in poses])))
     return avatar
 
 

@@ -23,10 +23,10 @@ import torch
 from torch import Tensor
 
 from benchmarks import frame
-from benchmarks.avatars import avatar_camera, avatar_of, poses_of
+from benchmarks.avatars import avatar_camera, avatar_of, bases_avatar_of
 from benchmarks.representations import folder_of, training
 from benchmarks.step import Frame, adam, frames_of, photometric, regularisers
-from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
+from pipeline.avatar import Avatar
 from pipeline.body import Pose
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.curves import read_curve
@@ -56,7 +56,6 @@ COUNTS, QUICK_COUNTS = (20_000, 84_000, 167_000), (5_000,)
 BATCHES = (1, 8)
 SIZE, QUICK_SIZE = 512, 128
 REPEATS, QUICK_REPEATS = 5, 1
-BASES = 8
 AWAKE = 0.02  # standard deviation that is added to every weight, so that no head is silent
 
 LIMITS = {"picture": 1e-3, "gradients": 0.05, "dB": 0.3}
@@ -247,7 +246,8 @@ def timings(
     """A row for each batch of a training step, and one for an animated frame."""
     size = options.size or (QUICK_SIZE if options.quick else SIZE)
     repeats = options.repeats or (QUICK_REPEATS if options.quick else REPEATS)
-    avatar = avatar_in_motion(count, representation).to(device)
+    make = bases_avatar_of if representation == "bases" else avatar_of
+    avatar = make(count).to(device)
     frames = frames_of(avatar, max(BATCHES), size)
     optimizer = adam(avatar, fused=True)
     case = {"representation": representation, "Gaussians": len(avatar), "size": size}
@@ -259,16 +259,6 @@ def timings(
     avatar.eval()
     shown = timed_job(lambda: show(avatar, next(turns), camera), device, repeats)
     return [*rows, {**case, "what": "frame", "batch": 1, **shown}]
-
-
-def avatar_in_motion(count: int, representation: str) -> Avatar:
-    """An avatar of about ``count`` Gaussians with what follows the pose awake."""
-    sizes = Architecture(representation=representation, bases=BASES if representation == "bases" else 0)
-    avatar = avatar_of(count, sizes)
-    poses = poses_of(avatar, 2 * BASES)
-    theta = torch.stack([pose_features(pose.rotation) for pose in poses])
-    avatar.representation.set_clip(ClipConditions(theta, torch.stack([pose.expression for pose in poses])))
-    return avatar
 
 
 def timed_job(job: Callable[[], object], device: torch.device, repeats: int) -> dict[str, Any]:
@@ -287,7 +277,7 @@ def take_step(avatar: Avatar, optimizer: torch.optim.Optimizer, frames: list[Fra
     for one in frames:
         posed = avatar.pose(decoded, one.pose, rows=one.seen if seen else None)
         picture = photometric(render(posed.gaussians, one.camera), one.target, one.background)
-        losses.append(picture + regularisers(decoded, posed))
+        losses.append(picture + regularisers(True, decoded, posed))
     (torch.stack(losses).sum() / len(frames)).backward()
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)

@@ -8,12 +8,17 @@ differs is the model's own arithmetic, and Adam's.
 
 "ours" asks the pose heads only for the Gaussians that the frame shows, as training does under
 ``train.pose_seen_only``; the others would get no gradient from it. "ours, all" asks them for every Gaussian.
+
+"bases" is the other representation, as many Gaussians with parameters and linear bases of their own, posed
+and regularised in one pass each; "bases, step by step" is its plain twin. They have no equal among the
+others and are compared with each other.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import statistics
 import sys
 
@@ -21,10 +26,19 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks import frame
-from benchmarks.avatars import add_sizes, avatar_camera, avatar_of, chosen_case, poses_of, sizes_of
+from benchmarks.avatars import (
+    add_sizes,
+    avatar_camera,
+    avatar_of,
+    bases_avatar_of,
+    chosen_case,
+    poses_of,
+    sizes_of,
+)
 from benchmarks.parts import PartClock
 from benchmarks.straightforward import StraightforwardAvatar, matched_gradients
 from pipeline.avatar import Avatar, Decoded, Posed
+from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.body import Pose
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over
@@ -33,18 +47,20 @@ from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
 from stages.train.body_regions import unmixed
+from stages.train.laplacian_kernel import mean_laplacian
 
 REST = "pose, skin"
 PARTS = ("triplane", "static heads", "pose heads", REST, "render", "losses", "regularisers", "Adam")
 STILL = 1e-9  # learning rate: every repetition does the same work
 OURS, ALL, OURS_SINGLE, PLAIN = "ours", "ours, all", "ours float32", "straightforward"
+BASES, TWIN = "bases", "bases, step by step"
 
 
 def measure(options: argparse.Namespace, report: frame.Report) -> str:
     """Compares and times every case."""
     counts, sizes, repeats = sizes_of(options, repeats=7)
     for count in counts:
-        contestants = contestants_of(count, options.clock)
+        contestants, bases = contestants_of(count, options.clock), bases_of(count, options.clock)
         for size in sizes:
             avatar = contestants[0].model
             assert isinstance(avatar, Avatar)
@@ -53,14 +69,19 @@ def measure(options: argparse.Namespace, report: frame.Report) -> str:
                 image, gradient = difference(one, contestants[-1], frames)
                 row = {"gaussians": len(avatar), "size": size, "contestant": one.name}
                 report.add(row | {"image": image, "gradients": gradient}, f"apart from {PLAIN}")
-            for row in race(contestants, frames, repeats):
+            image, gradient = bases_difference(*bases, frames)
+            row = {"gaussians": len(avatar), "size": size, "contestant": BASES}
+            report.add(row | {"image": image, "gradients": gradient}, f"apart from {TWIN}")
+            for row in race([*contestants, *bases], frames, repeats):
                 report.add({"gaussians": len(avatar), "size": size, **row})
     count, size, case = chosen_case(report.tables["rows"])
     fastest = {row["contestant"]: row["step_ms"] for row in case}
     ratio, whole, single = (fastest[PLAIN] / fastest[name] for name in (OURS, ALL, OURS_SINGLE))
+    triplane, twin = (fastest[name] / fastest[BASES] for name in (OURS, TWIN))
     return (
         f"{count} Gaussians at {size}²: {fastest[OURS]:.1f} ms; {PLAIN} takes {ratio:.2f} times ours "
-        f"({whole:.2f} where every Gaussian is posed, {single:.2f} of these in float32)"
+        f"({whole:.2f} where every Gaussian is posed, {single:.2f} of these in float32); bases "
+        f"{fastest[BASES]:.1f} ms: ours takes {triplane:.2f} times that, bases step by step {twin:.2f} times"
     )
 
 
@@ -114,12 +135,14 @@ class Contestant:
         self.name, self.model, self.optimizer, self.shared, self.seen = name, model, optimizer, shared, seen
         self.clock = PartClock(REST, frame.CLOCKS[clock])
         networks = model.representation if isinstance(model, Avatar) else model
-        self.clock.watch("triplane", networks.triplane)
-        self.clock.watch("static heads", networks.geometry, networks.color)
-        self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
+        if not isinstance(networks, BasesRepresentation):
+            self.clock.watch("triplane", networks.triplane)
+            self.clock.watch("static heads", networks.geometry, networks.color)
+            self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
         self._render = self.clock.timed("render", render)
         self._compare = self.clock.timed("losses", photometric)
-        self._regularise = self.clock.timed("regularisers", regularisers)
+        at_once = isinstance(networks, BasesRepresentation) and model.at_once
+        self._regularise = self.clock.timed("regularisers", functools.partial(regularisers, at_once))
 
     def step(self, frames: list[Frame]) -> Tensor:
         """One optimiser step over the frames; returns the loss. The clock holds what it cost."""
@@ -159,13 +182,15 @@ def photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Ten
     return 0.8 * losses.l1(image, target).mean() + 0.2 * ssim_loss(image, target)
 
 
-def regularisers(decoded: Decoded, posed: Posed) -> Tensor:
-    """The loss of a posed avatar, roughness and size."""
+def regularisers(at_once: bool, decoded: Decoded, posed: Posed) -> Tensor:
+    """The loss of a posed avatar, roughness and size; roughness in one pass where that is asked for."""
     neighbours, colors, pose_offset = decoded.surface.neighbours, posed.gaussians.colors, posed.pose_offset
     assert pose_offset is not None
     same = None if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
 
     def roughness(values: Tensor, mask: Tensor | None = None) -> Tensor:
+        if at_once:
+            return mean_laplacian(values, neighbours, mask)
         return losses.weighted_mean(losses.laplacian(values, neighbours), mask)
 
     smooth = (
@@ -205,6 +230,28 @@ def contestants_of(count: int, clock: str) -> list[Contestant]:
         Contestant(OURS_SINGLE, single, adam(single, fused=True), shared=True, clock=clock),
         Contestant(PLAIN, plain, adam(plain, fused=False), shared=False, clock=clock),
     ]
+
+
+def bases_of(count: int, clock: str) -> tuple[Contestant, Contestant]:
+    """Linear bases in one pass and step by step, from the same weights."""
+    fused, plain = bases_avatar_of(count), bases_avatar_of(count)
+    plain.at_once = False
+    both = ((BASES, fused), (TWIN, plain))
+    made = [Contestant(name, one, adam(one, fused=True), shared=True, clock=clock) for name, one in both]
+    return made[0], made[1]
+
+
+def bases_difference(fused: Contestant, plain: Contestant, frames: list[Frame]) -> tuple[float, float]:
+    """As ``difference``, of two avatars of bases."""
+    images, gradients = [], []
+    for one in (fused, plain):
+        one.objective(frames).backward()
+        gradients.append([parameter.grad for parameter in one.model.parameters()])
+        one.model.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            images.append(render(one.pose(one.model.decode(), frames[0]).gaussians, frames[0].camera).color)
+    apart = [float((mine - theirs).norm() / theirs.norm()) for mine, theirs in zip(*gradients, strict=True)]
+    return float((images[0] - images[1]).abs().mean()), max(apart)
 
 
 def adam(model: nn.Module, fused: bool) -> torch.optim.Adam:

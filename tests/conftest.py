@@ -1,4 +1,4 @@
-"""What the tests share: where third-party assets and the shared clips lie, if they are there."""
+"""What the tests share: the open body, a small subject, where assets and shared clips lie, if anywhere."""
 
 import os
 from pathlib import Path
@@ -28,4 +28,48 @@ def shared_folder() -> Path:
     folder = REPOSITORY.parent / "shared"
     if not folder.is_dir():
         pytest.skip("there is no ../shared here")
+    return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def body_read_once():
+    """Stages that read a fitted clip get the open body that was read before: reading takes half a second."""
+    from pipeline.clip import fitted_clip  # here, as the lines above come before torch's threads
+    from tests.made.body import BODY_FILE, open_body
+
+    read = fitted_clip.load_body
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitted_clip, "load_body", lambda path: open_body() if path == BODY_FILE else read(path))
+        yield
+
+
+@pytest.fixture(scope="session")
+def body():
+    """The open body."""
+    from tests.made.body import open_body
+
+    return open_body()
+
+
+@pytest.fixture(scope="session")
+def landmarks():
+    """Where keypoints lie on the open body."""
+    from tests.made.body import open_landmarks
+
+    return open_landmarks()
+
+
+@pytest.fixture(scope="session")
+def model(body, landmarks):
+    """The open body and its landmarks, as registration takes them."""
+    return body, landmarks
+
+
+@pytest.fixture(scope="session")
+def subject(tmp_path_factory) -> Path:
+    """The painted subject in the folders of ingest, fit and plan. Read only: all tests look at this one."""
+    from tests.made.portrait import write_subject
+
+    folder = tmp_path_factory.mktemp("subject")
+    write_subject(folder)
     return folder

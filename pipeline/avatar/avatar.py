@@ -18,13 +18,14 @@ from torch import Tensor, nn
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.avatar.canonical import Canonical, build_canonical
-from pipeline.avatar.representation import Condition, Decoded, Representation
+from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.representation import Condition, Decoded, LinearChange, Representation
 from pipeline.avatar.residual import regions
 from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
 from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
 from pipeline.avatar.triplane_representation import TriplaneRepresentation
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
-from pipeline.device import moved
+from pipeline.device import kernels_serve, moved
 from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
@@ -68,13 +69,21 @@ class Avatar(nn.Module):
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
+        at_once: posed in one pass over the Gaussians where that can be (``fused_posing.py``), else step by
+            step, which gives the same.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
+        trust: [N, 2] in [0, 1], how far evidence bears out what was learnt of colour and of shape, see
+            ``evidence.py``; 1 before that is known.
+        completion: [N, 9], offset, log scale and colour logits of the finished avatar where the
+            representation cannot hold them, see ``completion.py``; [0, 9] where it does not need to.
     """
 
     base_color: Tensor
     active: Tensor
     skin_rows: Tensor
+    trust: Tensor
+    completion: Tensor
 
     def __init__(
         self,
@@ -105,6 +114,7 @@ class Avatar(nn.Module):
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
+        self.at_once = True
         self.splits = tuple(splits)
         if self.splits:
             meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
@@ -120,9 +130,12 @@ class Avatar(nn.Module):
         self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
         self.register_buffer("active", torch.ones(len(vertex_ids), dtype=torch.bool))
         self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
+        self.register_buffer("trust", torch.ones(len(meshes[-1]), 2))
+        self.register_buffer("completion", torch.zeros(0, 9))
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
         self._restricted: dict[int, tuple[Tensor, Surface]] = {}
+        self._posing: tuple[Surface, PosingTables] | None = None
         self.representation = self._make_representation(seed)
         self._baked: Decoded | None = None
 
@@ -210,7 +223,29 @@ class Avatar(nn.Module):
     def decode(self, level: int = -1) -> Decoded:
         """The pose-independent part, on one level of subdivision (the finest by default)."""
         surface = self.surface(level)
-        return self.representation.decode(surface, surface.pick(self.base_color))
+        decoded = self.representation.decode(surface, surface.pick(self.base_color))
+        if not len(self.completion):
+            return decoded
+        offset, log_scale, color_logit = surface.pick(self.completion).split(3, dim=1)
+        return dataclasses.replace(decoded, offset=offset, log_scale=log_scale, color_logit=color_logit)
+
+    @torch.no_grad()
+    def take_completion(self, rows: Tensor, completed: Decoded) -> None:
+        """Takes completed values for its own; what follows the pose fades out with trust.
+
+        Args:
+            rows: [M] int64, which Gaussians of the finest level.
+            completed: their pose-independent part.
+        """
+        trust, base = self.trust[rows], self.base_color[rows]
+        if not self.representation.take_completion(rows, completed, base, trust):
+            values = torch.cat([completed.offset, completed.log_scale, completed.color_logit], 1)
+            self.completion = self.trust.new_zeros(len(self.trust), 9).index_copy_(0, rows, values)
+        self._baked = None
+
+    def pose_share(self, surface: Surface) -> Tensor | None:
+        """The share that is shown of what follows the pose, colour and shape, [N, 2]; None for all."""
+        return surface.pick(self.trust) if len(self.completion) else None
 
     def pose(
         self,
@@ -234,19 +269,32 @@ class Avatar(nn.Module):
         """
         canonical = decoded.surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        theta = pose_features(pose.rotation.detach()) if theta is None else theta
+        theta = theta if noise is None else theta + noise
+        condition = Condition(theta, pose.expression, time)
+        # One pass computes on a CPU, for all Gaussians, and knows no pose correctives.
+        if (
+            self.at_once
+            and rows is None
+            and canonical.pose_directions is None
+            and kernels_serve(decoded.offset)
+        ):
+            linear = self.representation.linear_change(decoded, condition)
+            if linear is not None:
+                return self._pose_at_once(decoded, linear, transforms, pose)
         blended = blend_transforms(transforms, canonical.skinning_weights)
         shape = decoded.offset + _rest_shape(canonical, pose)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
-        theta = pose_features(pose.rotation.detach()) if theta is None else theta
-        theta = theta if noise is None else theta + noise
-        condition, rest = Condition(theta, pose.expression, time), shape
+        rest = shape
         change = None
         if self.pose_heads_active:
             tables = decoded.surface.skinning_tables
             change = self.representation.change(
                 decoded, condition, lambda: tables.normals(transforms, rest), rows
             )
+        share = self.pose_share(decoded.surface)
         if change is not None:
+            change = change if share is None else change.scaled(share)
             pose_offset = change.offset * self.architecture.pose_offset_unit * decoded.surface.pose_movable
             shape = shape + pose_offset
             log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
@@ -256,6 +304,7 @@ class Avatar(nn.Module):
         if self.residuals_active:
             answer = self.representation.residual(decoded, means, condition, rows)
         if answer is not None:
+            answer = answer if share is None else scaled_residual(answer, share)
             residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(
@@ -266,6 +315,44 @@ class Avatar(nn.Module):
             opacities=self._opacities(canonical),
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
+
+    def _pose_at_once(self, decoded: Decoded, change: LinearChange, transforms: Tensor, pose: Pose) -> Posed:
+        """As ``pose`` does step by step, in one pass over the Gaussians."""
+        active = self.pose_heads_active and len(change.signal) > 0
+        posed = pose_at_once(
+            self.posing_tables(decoded.surface),
+            decoded.offset,
+            decoded.log_scale,
+            decoded.color_logit,
+            change if active else change.none(),
+            transforms,
+            pose.transl,
+            pose.expression,
+        )
+        gaussians = Gaussians(
+            posed.means,
+            posed.quaternions,
+            posed.scales,
+            posed.colors,
+            self._opacities(decoded.surface.canonical),
+        )
+        pose_offset = posed.pose_offset if active else None
+        return Posed(gaussians, pose_offset, decoded.log_scale, posed.color_logit)
+
+    def posing_tables(self, surface: Surface) -> PosingTables:
+        """The tables that posing in one pass reads of a surface, made once until another takes its place."""
+        if self._posing is None or self._posing[0] is not surface:
+            canonical = surface.canonical
+            tables = PosingTables.build(
+                surface.skinning_tables,
+                canonical.vertices,
+                *canonical.expressive(),
+                self._initial_scales(canonical),
+                self.architecture.pose_offset_unit * surface.pose_movable,
+                (*LOG_SCALE_RANGE, LARGEST_SCALE),
+            )
+            self._posing = surface, tables
+        return self._posing[1]
 
     def _moved(self, means: Tensor, blended: Tensor, move: Tensor) -> Tensor:
         """The centres, moved by what the residual heads say at rest, [N, 3]; as they are for [N, 0]."""
@@ -278,10 +365,13 @@ class Avatar(nn.Module):
         return torch.full((len(canonical),), self.architecture.opacity, device=self.device)
 
     def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
+        initial = self._initial_scales(canonical)
+        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+
+    def _initial_scales(self, canonical: Canonical) -> Tensor:
         across = canonical.spacing * self.architecture.scale
         thick = across.mean(1, keepdim=True) * self.architecture.thickness
-        initial = torch.cat([across, thick], 1)
-        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+        return torch.cat([across, thick], 1)
 
     def gaussians(
         self,
@@ -349,6 +439,11 @@ def pose_features(rotation: Tensor) -> Tensor:
     """
     matrices = roma.rotvec_to_rotmat(rotation[1:])
     return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
+
+
+def scaled_residual(answer: Tensor, share: Tensor) -> Tensor:
+    """A share, [N, 2], of residual colours and moves: [N, 3] or [N, 6]."""
+    return torch.cat([answer[:, :3] * share[:, :1], answer[:, 3:] * share[:, 1:]], 1)
 
 
 def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:

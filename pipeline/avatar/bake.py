@@ -9,13 +9,15 @@ has no gradient.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features
-from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features, scaled_residual
+from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded, LinearChange
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
 from pipeline.splat import Gaussians
@@ -34,6 +36,7 @@ class Constants:
         log_scale, color_logit: [N, 3], of the static heads.
         offset_unit: [N, 1], metres that a pose-dependent offset of 1 stands for.
         joints: [55, 3], metres.
+        pose_share: [N, 2], the share that is shown of what follows the pose, colour and shape; None for all.
     """
 
     points: Tensor
@@ -45,6 +48,7 @@ class Constants:
     color_logit: Tensor
     offset_unit: Tensor
     joints: Tensor
+    pose_share: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,16 +91,23 @@ class BakedAvatar:
         """
         constants, theta = self.constants, pose_features(pose.rotation) if theta is None else theta
         transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
-        points = self._rest_shape(pose)
+        condition = Condition(theta, pose.expression, time)
+        linear = self.representation.linear_change(condition)
+        if linear is not None and not len(constants.correctives):
+            return self._pose_at_once(linear, transforms, pose)
+        points = rest = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
-        condition, rest = Condition(theta, pose.expression, time), points
         change = self.representation.change(condition, lambda: self.skinning_tables.normals(transforms, rest))
+        share = constants.pose_share
         if change is not None:
+            change = change if share is None else change.scaled(share)
             points = torch.addcmul(points, change.offset, constants.offset_unit)
             log_scale = log_scale if change.log_scale is None else log_scale + change.log_scale
             color_logit = color_logit + change.color_logit
         means, quaternions = self.skinning_tables.place(transforms, points, pose.transl)
         answers = self.representation.residuals(means, condition)
+        if share is not None:
+            answers = [(rows, scaled_residual(answer, share[rows])) for rows, answer in answers]
         if self.residual_unit:
             for rows, answer in answers:
                 points = points.index_add(0, rows, self.residual_unit * answer[:, 3:])
@@ -110,6 +121,27 @@ class BakedAvatar:
             scales=scales.clamp_(max=LARGEST_SCALE),
             colors=color_logit.sigmoid(),
             opacities=torch.full((len(points),), self.opacity),
+        )
+
+    def _pose_at_once(self, change: LinearChange, transforms: Tensor, pose: Pose) -> Gaussians:
+        """As ``gaussians`` does step by step, in one pass over the Gaussians."""
+        learnt = (None, self.constants.log_scale, self.constants.color_logit, change)
+        posed = pose_at_once(self.posing_tables, *learnt, transforms, pose.transl, pose.expression)
+        opacities = torch.full((len(self),), self.opacity)
+        return Gaussians(posed.means, posed.quaternions, posed.scales, posed.colors, opacities)
+
+    @functools.cached_property
+    def posing_tables(self) -> PosingTables:
+        """The tables that posing in one pass reads."""
+        constants = self.constants
+        return PosingTables.build(
+            self.skinning_tables,
+            constants.points,
+            constants.expressive,
+            constants.expressions,
+            constants.scales,
+            constants.offset_unit,
+            (*LOG_SCALE_RANGE, LARGEST_SCALE),
         )
 
     def _rest_shape(self, pose: Pose) -> Tensor:
@@ -144,16 +176,17 @@ def bake(avatar: Avatar) -> BakedAvatar:
 
 def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
     canonical, sizes = decoded.surface.canonical, avatar.architecture
-    expressive = torch.nonzero(canonical.expression_directions.flatten(1).any(1))[:, 0]
+    expressive, expressions = canonical.expressive()
     correctives, across = canonical.pose_directions, canonical.spacing * sizes.scale
     return Constants(
         points=canonical.vertices + decoded.offset,
         expressive=expressive,
-        expressions=canonical.expression_directions[expressive].contiguous(),
+        expressions=expressions,
         correctives=torch.zeros(0, 3, 0) if correctives is None else correctives.bfloat16(),
         scales=torch.cat([across, across.mean(1, keepdim=True) * sizes.thickness], 1),
         log_scale=decoded.log_scale.contiguous(),
         color_logit=decoded.color_logit.contiguous(),
         offset_unit=sizes.pose_offset_unit * decoded.surface.pose_movable,
         joints=canonical.joints,
+        pose_share=avatar.pose_share(decoded.surface),
     )

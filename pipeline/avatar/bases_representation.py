@@ -19,6 +19,7 @@ from pipeline.avatar.representation import (
     ClipConditions,
     Condition,
     Decoded,
+    LinearChange,
     Normals,
     Representation,
 )
@@ -75,7 +76,7 @@ class BasesRepresentation(Representation):
         """The parameters of the surface's Gaussians."""
         return Decoded(
             surface=surface,
-            features=_picked(self.bases, surface),
+            features=self.bases if torch.is_grad_enabled() else self.bases.detach(),
             offset=_picked(self.offset, surface) * self._offset_unit,
             log_scale=_picked(self.log_scale, surface),
             color_logit=base_color + _picked(self.color, surface),
@@ -91,7 +92,18 @@ class BasesRepresentation(Representation):
         """
         if not len(self):
             return None
-        return _change(self.signal, self._expressions, decoded.features, condition, rows)
+        linear = self.linear_change(decoded, condition)
+        bases = _picked(decoded.features, decoded.surface)
+        return _change(bases, linear.signal, rows)
+
+    def linear_change(self, decoded: Decoded, condition: Condition) -> LinearChange:
+        """The bases where they lie, and the driving signal; no gradient reaches the pose.
+
+        Raises:
+            NotFiniteError: pose or expression is not finite.
+        """
+        signal = _driven(self.signal, self._expressions, condition)
+        return LinearChange(decoded.features, signal, decoded.surface.rows)
 
     def set_clip(self, clip: ClipConditions) -> None:
         """Finds the driving signal.
@@ -117,13 +129,26 @@ class BasesRepresentation(Representation):
 
     def bake(self, decoded: Decoded, pose_dependent: bool, residuals: bool) -> BakedRepresentation:
         """The bases as they are: there is nothing that could be computed beforehand."""
-        bases = decoded.features if pose_dependent else decoded.features[:, :0]
-        return BakedBases(self.signal, self._expressions, bases)
+        bases = _picked(decoded.features, decoded.surface)
+        return BakedBases(self.signal, self._expressions, bases if pose_dependent else bases[:, :0])
 
     @torch.no_grad()
     def forget_unseen(self, seen: Tensor) -> None:
         """Sets the bases of Gaussians that no frame showed to zero: smoothness alone has moved them."""
         self.bases[~seen] = 0.0
+
+    @torch.no_grad()
+    def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
+        """Takes the values as its own parameters: True."""
+        # What is fully trusted stays as it is, to the byte.
+        some = (share < 1).any(1)
+        chosen = rows[some]
+        self.offset[chosen] = completed.offset[some] / self._offset_unit
+        self.log_scale[chosen] = completed.log_scale[some]
+        self.color[chosen] = (completed.color_logit - base_color)[some]
+        each = share[some].repeat_interleave(3, 1)  # red, green, blue, x, y, z
+        self.bases[chosen] *= each.repeat_interleave(len(self), 1)
+        return True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,23 +167,29 @@ class BakedBases(BakedRepresentation):
 
     def change(self, condition: Condition, normals: Normals) -> Change | None:
         """The bases' sum, weighted by the driving signal."""
-        if not self.bases.shape[1]:
-            return None
-        return _change(self.signal, self.expressions, self.bases, condition)
+        linear = self.linear_change(condition)
+        return _change(linear.bases, linear.signal) if len(linear.signal) else None
+
+    def linear_change(self, condition: Condition) -> LinearChange:
+        """The bases and the driving signal."""
+        found = LinearChange(self.bases, _driven(self.signal, self.expressions, condition))
+        return found if self.bases.shape[1] else found.none()
+
+
+def _driven(signal: DrivingSignal, expressions: int, condition: Condition) -> Tensor:
+    """The driving signal of a frame, [K]."""
+    told = {"theta": condition.theta.detach(), "the expression": condition.expression.detach()}
+    require_finite(told, "posing", "in the driving signal", "mend the motion or the pose")
+    return signal(signal_features(*told.values(), expressions))
 
 
 def _change(
-    signal: DrivingSignal,
-    expressions: int,
     bases: Tensor,  # [N, 6 K]
-    condition: Condition,
+    signal: Tensor,  # [K]
     rows: Tensor | None = None,
 ) -> Change:
-    told = {"theta": condition.theta.detach(), "the expression": condition.expression.detach()}
-    require_finite(told, "posing", "in the driving signal", "mend the motion or the pose")
-    weights = signal(signal_features(*told.values(), expressions))
     asked = bases if rows is None else gather_rows(bases, rows)
-    answer = (asked.reshape(-1, len(weights)) @ weights).view(-1, 6)
+    answer = (asked.reshape(-1, len(signal)) @ signal).view(-1, 6)
     if rows is not None:
         answer = scatter_rows(answer, rows, len(bases))
     return Change(offset=answer[:, 3:], color_logit=answer[:, :3])

@@ -74,6 +74,11 @@ class Canonical:
         )
         return torch.isin(self.parts, wanted)
 
+    def expressive(self) -> tuple[Tensor, Tensor]:
+        """The vertices that expressions move, [P] int64, and how, [P, 3, E] metres a unit."""
+        rows = torch.nonzero(self.expression_directions.flatten(1).any(1))[:, 0]
+        return rows, self.expression_directions[rows].contiguous()
+
     def neighbour_mean(self) -> SparsePair:
         """[N, N]: the mean over a vertex's neighbours, the uniform Laplacian's second half."""
         start, end = directed_edges(self.faces).unbind(1)

@@ -24,8 +24,8 @@ class Decoded:
 
     Attributes:
         surface: the level that was decoded.
-        features: [N, C], what the pose-dependent part reads of each Gaussian: the triplane's ``f_i``, or the
-            linear bases.
+        features: what the pose-dependent part reads: the triplane's ``f_i``, [N, C]; or the linear bases
+            [M, C], of every Gaussian of the finest level, see ``surface.rows``.
         offset: [N, 3], Delta V_tri, metres.
         log_scale: [N, 3], S_tri, relative to the initial scale.
         color_logit: [N, 3], C_tri, before the sigmoid.
@@ -83,6 +83,31 @@ class Change:
     color_logit: Tensor
     log_scale: Tensor | None = None
 
+    def scaled(self, share: Tensor) -> Change:
+        """A share of it, [N, 2]: of the colour and of the rest."""
+        color, shape = share[:, :1], share[:, 1:]
+        log_scale = None if self.log_scale is None else self.log_scale * shape
+        return Change(self.offset * shape, self.color_logit * color, log_scale)
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearChange:
+    """A change that is a sum of bases, each times one number of a signal.
+
+    Attributes:
+        bases: [M, 6 K], K values each of red, green, blue (logits), x, y and z (as ``Change.offset``).
+        signal: [K], without gradient.
+        rows: [N] int64, the row of ``bases`` that is each Gaussian's; None where it is its own number.
+    """
+
+    bases: Tensor  # [M, 6 K]
+    signal: Tensor  # [K]
+    rows: Tensor | None = None  # [N]
+
+    def none(self) -> LinearChange:
+        """The same of no bases: nothing changes."""
+        return LinearChange(self.bases[:, :0].detach(), self.signal[:0], self.rows)
+
 
 class BakedRepresentation(abc.ABC):
     """The pose-dependent part of a finished avatar, ready to be evaluated without gradient."""
@@ -90,6 +115,10 @@ class BakedRepresentation(abc.ABC):
     @abc.abstractmethod
     def change(self, condition: Condition, normals: Normals) -> Change | None:
         """The change before skinning; None where there is none."""
+
+    def linear_change(self, condition: Condition) -> LinearChange | None:
+        """As ``Representation.linear_change``."""
+        return None
 
     def residuals(self, means: Tensor, condition: Condition) -> list[tuple[Tensor, Tensor]]:
         """Rows, [M], and residual colours of each part, [M, 3], or [M, 6] with moves, after skinning."""
@@ -128,6 +157,13 @@ class Representation(nn.Module, abc.ABC):
                 all if None.
         """
 
+    def linear_change(self, decoded: Decoded, condition: Condition) -> LinearChange | None:
+        """The change of all Gaussians as bases and their signal; None where it is not of this kind.
+
+        Who answers has no residual colours: ``change`` is all that follows pose and face.
+        """
+        return None
+
     def residual(
         self, decoded: Decoded, means: Tensor, condition: Condition, rows: Tensor | None = None
     ) -> Tensor | None:
@@ -165,3 +201,17 @@ class Representation(nn.Module, abc.ABC):
         Args:
             seen: [N] bool, the Gaussians of the finest level that a training frame showed.
         """
+
+    def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
+        """Takes completed values for what it decodes to, and lets what follows the pose fade.
+
+        Args:
+            rows: [M] int64, which Gaussians of the finest level.
+            completed: their pose-independent part.
+            base_color: [M, 3], what their colours are added to.
+            share: [M, 2] in [0, 1], of colours and of places that follow the pose that is left.
+
+        Returns:
+            False if it cannot, because its values are not a Gaussian's own: the avatar keeps them then.
+        """
+        return False

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numba
 import numpy as np
 import roma
 import scipy.spatial
@@ -17,10 +16,10 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.canonical import Canonical
-from pipeline.avatar.head_kernels import CHUNKS
+from pipeline.avatar.skinning_kernels import normals_of_vertices, place_gaussians, skin_points
 from pipeline.body import blend_transforms, transform_points, vertex_normals
 from pipeline.device import kernels_serve
-from pipeline.numba_kernels import checked_parallel_kernel, inline_kernel, use_torch_threads
+from pipeline.numba_kernels import use_torch_threads
 
 OWN = -1  # in place of a row: the weights that a point had
 
@@ -133,119 +132,6 @@ def _blended(tables: SkinningTables, transforms: Tensor) -> Tensor:
     weights = transforms.new_zeros(len(tables.weights), len(transforms))
     weights.scatter_(1, tables.joints_of.long(), tables.weights.to(weights))
     return blend_transforms(transforms, weights)
-
-
-@inline_kernel
-def _blend(transforms, joints, weights, point, blended):
-    for k in range(12):
-        blended[k] = 0
-    for place in range(joints.shape[1]):
-        weight, joint = weights[point, place], joints[point, place]
-        for k in range(12):
-            blended[k] += weight * transforms[joint, k]
-
-
-@checked_parallel_kernel
-def skin_points(transforms, joints, weights, points, posed):
-    """Rest points carried to their pose.
-
-    Args:
-        transforms: [55, 12] float32, each joint's [3, 4] matrix row by row.
-        joints, weights: [N, K], as ``joints_of_points`` gives them.
-        points: [N, 3], metres.
-        posed: output [N, 3], metres.
-    """
-    count = points.shape[0]
-    step = (count + CHUNKS - 1) // CHUNKS
-    for chunk in numba.prange(CHUNKS):
-        blended = np.empty(12, np.float32)
-        for i in range(chunk * step, min(count, (chunk + 1) * step)):
-            _blend(transforms, joints, weights, i, blended)
-            for row in range(3):
-                value = blended[4 * row + 3]
-                for column in range(3):
-                    value += blended[4 * row + column] * points[i, column]
-                posed[i, row] = value
-
-
-@checked_parallel_kernel
-def normals_of_vertices(vertices, faces, starts, around, normals):
-    """Unit normals, area-weighted over the faces around each vertex, as ``pipeline.body.vertex_normals``.
-
-    Args:
-        vertices: [N, 3], metres.
-        faces: [F, 3] int32.
-        starts, around: as ``faces_of_vertices`` gives them.
-        normals: output [N, 3]; zero where there is no face.
-    """
-    count = vertices.shape[0]
-    step = (count + CHUNKS - 1) // CHUNKS
-    area = np.empty((faces.shape[0], 3), np.float32)
-    for f in numba.prange(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, vx = vertices[b, 0] - vertices[a, 0], vertices[c, 0] - vertices[a, 0]
-        uy, vy = vertices[b, 1] - vertices[a, 1], vertices[c, 1] - vertices[a, 1]
-        uz, vz = vertices[b, 2] - vertices[a, 2], vertices[c, 2] - vertices[a, 2]
-        area[f, 0], area[f, 1], area[f, 2] = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    for chunk in numba.prange(CHUNKS):
-        for i in range(chunk * step, min(count, (chunk + 1) * step)):
-            x, y, z = np.float32(0), np.float32(0), np.float32(0)
-            for place in range(starts[i], starts[i + 1]):
-                f = around[place]
-                x, y, z = x + area[f, 0], y + area[f, 1], z + area[f, 2]
-            length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
-            normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
-
-
-@inline_kernel
-def _write_quaternion(m, quaternion):
-    """A nearly orthonormal matrix [3, 3] as a unit quaternion, wxyz, by the largest of its parts."""
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    i = 0
-    for k in range(1, 3):
-        if m[k, k] > m[i, i]:
-            i = k
-    if trace >= m[i, i]:
-        quaternion[0] = 1 + trace
-        quaternion[1], quaternion[2], quaternion[3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quaternion[0] = m[k, j] - m[j, k]
-        quaternion[1 + i] = 1 - trace + 2 * m[i, i]
-        quaternion[1 + j], quaternion[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
-    square = np.float32(0)
-    for k in range(4):
-        square += quaternion[k] * quaternion[k]
-    for k in range(4):
-        quaternion[k] /= np.sqrt(square)
-
-
-@checked_parallel_kernel
-def place_gaussians(transforms, joints, weights, points, frames, transl, means, quaternions):
-    """Centres and orientations of the Gaussians in the world.
-
-    Args:
-        transforms, joints, weights, points: as for ``skin_points``.
-        frames: [N, 3, 3], the Gaussians' axes at rest.
-        transl: [3], metres.
-        means, quaternions: outputs [N, 3] metres and [N, 4] wxyz.
-    """
-    count = points.shape[0]
-    step = (count + CHUNKS - 1) // CHUNKS
-    for chunk in numba.prange(CHUNKS):
-        blended, turned = np.empty(12, np.float32), np.empty((3, 3), np.float32)
-        for i in range(chunk * step, min(count, (chunk + 1) * step)):
-            _blend(transforms, joints, weights, i, blended)
-            for row in range(3):
-                value = blended[4 * row + 3] + transl[row]
-                for column in range(3):
-                    value += blended[4 * row + column] * points[i, column]
-                    total = np.float32(0)
-                    for k in range(3):
-                        total += blended[4 * row + k] * frames[i, k, column]
-                    turned[row, column] = total
-                means[i, row] = value
-            _write_quaternion(turned, quaternions[i])
 
 
 def nearest_rows(points: Tensor, original: Tensor, free: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from pipeline.avatar.avatar import Avatar
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError
 
-FORMAT = "flexiavatar-avatar-3"
+FORMAT = "flexiavatar-avatar-4"
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
@@ -51,6 +51,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         "pose_heads_active": avatar.pose_heads_active,
         "residuals_active": avatar.residuals_active,
         "unseen": avatar.unseen,
+        "completed": bool(len(avatar.completion)),
     }
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
@@ -106,6 +107,8 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
         avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
     except ValueError as error:
         raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    if header["completed"]:
+        avatar.completion = torch.zeros(len(avatar.trust), 9)
     names = {_stored_name(name): name for name in avatar.state_dict()}
     weights = {
         names.get(stored, stored): tensor

@@ -28,6 +28,7 @@ from pipeline.body import (
 )
 from pipeline.clip.boxes import Box, clip_box
 from pipeline.clip.camera import Camera
+from pipeline.clip.foreground import read_person
 from pipeline.clip.frames import read_frame, read_mask, spread_from_start
 from pipeline.clip.keypoints import Keypoints, read_keypoints
 from pipeline.clip.records import Footage, Split, read_cameras, read_footage, read_split
@@ -73,6 +74,10 @@ class FittedClip:
     def frame(self, frame: int) -> np.ndarray:
         """A frame as it was filmed, [H, W, 3] uint8 RGB."""
         return read_frame(self.folder / "frames", frame)
+
+    def colors(self, frame: int) -> np.ndarray:
+        """A frame with the person's own colours in the mask's soft edge, [H, W, 3] uint8 RGB."""
+        return read_person(self.folder, frame)[0]
 
     def mask(self, frame: int) -> np.ndarray:
         """The person's soft alpha in a frame, [H, W] uint8."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from pipeline.clip.boxes import Box
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite
-from pipeline.clip.frames import read_frame, read_mask
+from pipeline.clip.foreground import read_person
 from pipeline.errors import UserError
 
 CACHED_BYTES = 2**30  # frames beyond this are read again whenever they are asked for
@@ -25,7 +25,8 @@ class View:
     """One frame, or a box cut out of it.
 
     Attributes:
-        color: [H, W, 3] in [0, 1], the whole picture, not only the person.
+        color: [H, W, 3] in [0, 1], the whole picture, not only the person; where alpha is between 0 and 1 the
+            person's own colour, without the background that shines through.
         alpha: [H, W] in [0, 1], the person's soft mask.
         camera: of the picture.
         generated: whether a model made the picture; its losses then weigh less.
@@ -74,8 +75,8 @@ class ViewCache:
         return cropped(self.cameras[frame], self.box)
 
     def _pictures(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frame and mask, [H, W, 3] and [H, W] uint8."""
-        color, alpha = read_frame(self.folder / "frames", frame), read_mask(self.folder / "masks", frame)
+        """Colours and mask, [H, W, 3] and [H, W] uint8."""
+        color, alpha = read_person(self.folder, frame)
         camera, box = self.cameras[frame], self.box
         if color.shape[:2] != alpha.shape or alpha.shape != (camera.height, camera.width):
             raise UserError(

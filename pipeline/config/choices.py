@@ -14,6 +14,12 @@ LpipsNetwork = Literal["alex", "vgg"]
 ResidualPlace = Literal["canonical", "posed"]
 """The place of a Gaussian that its residual head is told; see ``pipeline.avatar.residual``."""
 
+UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""The axis of a motion's world that points up."""
+
+Up = Literal["auto", UpAxis]
+"""An axis, or the one that ``pipeline.motion.up_axis`` finds."""
+
 BodyPart = Literal[
     "torso", "head", "face", "left_arm", "right_arm", "left_hand", "right_hand", "left_leg", "right_leg"
 ]  # fmt: skip
@@ -31,5 +37,8 @@ RenderMask = Literal["own", "truth"]
 Refinement = Literal["plan", "on", "off"]
 """Whether held-out poses are refined on the held-out images: as the plan says, always, never."""
 
+EdgeColors = Literal["own", "photograph"]
+"""The truth's colours where its mask is soft: the person's own, or the photograph's, the wall among them."""
+
 ProtocolName = Literal["ours", "paper", "paper_black"]
-"""Named sets of the three choices before; see ``pipeline.config.evaluation_protocol``."""
+"""Named sets of the four choices before; see ``pipeline.config.evaluation_protocol``."""

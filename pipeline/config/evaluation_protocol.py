@@ -1,7 +1,8 @@
 """How an avatar's pictures are compared with the truth: every choice has a name, and sets of them have one.
 
 Published numbers differ by what was done besides rendering: what the person stands on, whose mask cuts
-the picture out, whether the pose was fitted to the very image that is scored. A protocol is a set of
+the picture out, whether the pose was fitted to the very image that is scored, and whether the truth's soft
+edge has the person's own colours or the photograph's. A protocol is a set of
 those choices; ``summary.json`` and every table say which were used. This module loads nothing heavy, for
 settings are read by the DAG.
 
@@ -16,11 +17,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, get_args
 
-from pipeline.config.choices import Background, ProtocolName, Refinement, RenderMask
+from pipeline.config.choices import Background, EdgeColors, ProtocolName, Refinement, RenderMask
 
 AUTO = "auto"
 OWN, TRUTH = get_args(RenderMask)
 PLAN, ON, OFF = get_args(Refinement)
+OWN_COLORS, PHOTOGRAPH = get_args(EdgeColors)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,12 +32,13 @@ class Protocol:
     background: Background
     render_mask: RenderMask
     refine_test_poses: Refinement
+    edge_colors: EdgeColors = "own"
 
 
 PROTOCOLS: Mapping[ProtocolName, Protocol] = {
     "ours": Protocol("black", OWN, PLAN),
-    "paper": Protocol("white", TRUTH, ON),  # its NeuMan table
-    "paper_black": Protocol("black", TRUTH, OFF),  # its TalkShow and ZJU-MoCap tables
+    "paper": Protocol("white", TRUTH, ON, PHOTOGRAPH),  # its NeuMan table
+    "paper_black": Protocol("black", TRUTH, OFF, PHOTOGRAPH),  # its TalkShow and ZJU-MoCap tables
 }
 """The protocols by name. ``ours`` lets a silhouette that is wrong cost something."""
 

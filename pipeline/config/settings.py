@@ -26,6 +26,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 
 SETTINGS = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 """Of every settings class: no other fields, no other types, finite numbers only."""
@@ -83,7 +84,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         UserError: the file is not there or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(decode_text(path.read_bytes()))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -101,6 +101,22 @@ class Estimator:
         return whole
 
 
+class FaceFinder:
+    """Looks for faces in single pictures."""
+
+    def __init__(self, asset: Path, native_log: Path) -> None:
+        """Load the model from the asset's folder; the arguments are those of ``Estimator``."""
+        solutions = load_mediapipe(asset)
+        self._native_log = native_log
+        with native_errors_to(native_log):
+            self._faces = solutions.face_detection.FaceDetection(model_selection=1)
+
+    def __call__(self, image: np.ndarray) -> bool:
+        """True where [H, W, 3] uint8 RGB shows a face."""
+        with native_errors_to(self._native_log):
+            return bool(self._faces.process(image).detections)
+
+
 def estimator_scale(width: int, height: int, short_side: int, long_side: int) -> float:
     """The factor by which a picture is resized for the estimator: at most 3, below 1 for large ones."""
     if max(width, height) > long_side:

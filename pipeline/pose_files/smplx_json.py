@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 from pipeline.pose_files.camera_frame import HAND_JOINTS
 from pipeline.pose_files.initial_poses import InitialPoses, on_frames
 
@@ -107,10 +108,12 @@ def _by_frame(folder: Path) -> dict[int, Path]:
 def _read_frame(path: Path) -> dict[str, np.ndarray] | None:
     """A file's arrays by name, flat; None if one that is there has an empty place."""
     try:
+        if not path.is_file():
+            raise ValueError("it is no regular file")
         if path.stat().st_size > _MEGABYTE:
             raise ValueError("it is larger than 1 MB")
         # Here alone NaN is no damage: some estimators write it where they found nobody.
-        value = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite)
+        value = json.loads(decode_text(path.read_bytes()), parse_float=_finite)
         if not isinstance(value, dict):
             raise ValueError("it is no JSON object")
         missing = [name for name in _NEEDED if name not in value]

@@ -109,7 +109,7 @@ class AvatarMeter:
 
     def _frame_quality(self, gaussians: Gaussians, clip: FittedClip, frame: int) -> Numbers:
         rendering, mask = render(gaussians, clip.cameras[frame]), clip.mask(frame)
-        person = partial(composite_frame, clip.frame(frame), mask)
+        person = partial(composite_frame, clip.colors(frame), mask)
 
         def picture(background: str) -> torch.Tensor:
             return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)

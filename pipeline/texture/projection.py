@@ -67,7 +67,7 @@ def gather_colors(
     normal = np.zeros((len(surface), 3), np.float32)
     for row, frame in enumerate(frames):
         vertices = clip.vertices(frame)
-        pictures = clip.frame(frame), clip.mask(frame)
+        pictures = clip.colors(frame), clip.mask(frame)
         colors[row], weights[row] = sample_frame(surface, clip.camera(frame), vertices, *pictures)
         normal += surface.refine(vertex_normals(vertices, surface.coarse)).numpy()
         advance()

@@ -6,6 +6,7 @@ import io
 import math
 import pickle
 import zipfile
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,19 @@ def read_npy(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> Any:
         raise UserError(f"{path} cannot be read as a numpy array ({error}): {remedy}") from None
 
 
-def read_npz(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> dict[str, Any]:
+def read_npz(
+    path: Path,
+    remedy: str,
+    most_bytes: int = GIGABYTE,
+    choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
+) -> dict[str, Any]:
     """The content of a ``.npz`` archive by name.
+
+    Args:
+        path: the file.
+        remedy: what the user can do; it ends the error's line.
+        most_bytes: of the file, and of what the chosen members unpack to.
+        choose: of the archive's names those to read; the others are not looked at, whatever they hold.
 
     Raises:
         UserError: as ``read_npy``, or it unpacks to more than is allowed.
@@ -43,10 +55,10 @@ def read_npz(path: Path, remedy: str, most_bytes: int = GIGABYTE) -> dict[str, A
     content = bounded_bytes(path, most_bytes, remedy)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            check_unpacked(archive, _MOST_MEMBERS, most_bytes)
-            return {
-                one.filename.removesuffix(".npy"): _parse(archive.read(one)) for one in archive.infolist()
-            }
+            members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
+            chosen = {name: members[name] for name in choose(members)}
+            check_unpacked(list(chosen.values()), _MOST_MEMBERS, most_bytes)
+            return {name: _parse(archive.read(one)) for name, one in chosen.items()}
     except Exception as error:  # a damaged archive raises nearly anything
         raise UserError(f"{path} cannot be read as an npz archive ({error}): {remedy}") from None
 

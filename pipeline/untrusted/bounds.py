@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import stat
 import warnings
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from pipeline.errors import UserError
@@ -51,7 +53,10 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         UserError: the file is missing, cannot be read, or is too large.
     """
     try:
-        size = path.stat().st_size
+        status = path.stat()
+        size = status.st_size
+        if not stat.S_ISREG(status.st_mode):  # reading a FIFO would wait for somebody who writes
+            raise UserError(f"{path} is no file that can be read as a whole: {remedy}")
         if size > most:
             raise UserError(f"{path} has {size >> 20} MB, more than the {most >> 20} MB allowed: {remedy}")
         with path.open("rb") as file:
@@ -62,9 +67,8 @@ def bounded_bytes(path: Path, most: int, remedy: str) -> bytes:
         raise UserError(f"{path} cannot be read ({error.strerror}): {remedy}") from None
 
 
-def check_unpacked(archive: zipfile.ZipFile, most_members: int, most_bytes: int) -> None:
-    """Refuse an archive by what it says it unpacks to; ValueError where that is too much."""
-    members = archive.infolist()
+def check_unpacked(members: Sequence[zipfile.ZipInfo], most_members: int, most_bytes: int) -> None:
+    """Refuse an archive's members by what they say they unpack to; ValueError where that is too much."""
     if len(members) > most_members or sum(one.file_size for one in members) > most_bytes:
         raise ValueError(f"it unpacks to more than {most_members} files or {most_bytes >> 20} MB")
 

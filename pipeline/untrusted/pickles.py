@@ -215,7 +215,7 @@ def _load_torch(content: bytes, most_bytes: int) -> Any:
     if not zipfile.is_zipfile(io.BytesIO(content)):
         return _load_legacy(io.BytesIO(content))
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        check_unpacked(archive, _MOST_MEMBERS, most_bytes)
+        check_unpacked(archive.infolist(), _MOST_MEMBERS, most_bytes)
         names = archive.namelist()
         index = next((name for name in sorted(names) if name.endswith("/data.pkl")), None)
         if index is None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 from pipeline.untrusted.bounds import bounded_bytes
 
 MOST_BYTES = 256 << 20  # the largest that is known, an INSTA transforms.json, has some MB
@@ -39,7 +40,7 @@ def parse_json(path: Path, remedy: str, most_bytes: int = MOST_BYTES, most_keys:
 
     try:
         return json.loads(
-            content.decode("utf-8"), parse_constant=_refuse, parse_float=_finite, parse_int=_whole,
+            decode_text(content), parse_constant=_refuse, parse_float=_finite, parse_int=_whole,
             object_pairs_hook=counted,
         )  # fmt: skip
     except RecursionError:
@@ -51,7 +52,7 @@ def parse_json(path: Path, remedy: str, most_bytes: int = MOST_BYTES, most_keys:
 def read_lines(path: Path, remedy: str, most: int = 1_000_000) -> list[str]:
     """The lines of a list without empty ones and spaces around; UserError where it is none, or too long."""
     try:
-        text = bounded_bytes(path, 64 << 20, remedy).decode("utf-8")
+        text = decode_text(bounded_bytes(path, 64 << 20, remedy))
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is no text ({error.reason}): {remedy}") from None
     lines = [line.strip() for line in text.splitlines() if line.strip()]

@@ -13,7 +13,7 @@ def loans(settings: AnimateSettings) -> tuple[Loan, ...]:
 
 STAGE = Stage(
     name="animate",
-    version=1,
+    version=2,
     settings=AnimateSettings,
     run="stages.animate.run:run",
     needs={

@@ -25,6 +25,7 @@ from pipeline.splat import Gaussians, Rendering, render, write_ply
 from stages.animate.actor import Actor, PoseRange, legs_share, make_actor
 from stages.animate.cameras import Animation, cameras_of, clip_start, turntable
 from stages.animate.exr_layers import NAMES, exr_layers, write_layers
+from stages.animate.idle_settings import idle_settings
 from stages.animate.motions.motion import Span
 from stages.animate.motions.placement import place
 from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_hands
@@ -50,6 +51,10 @@ def run(context: Context) -> None:
     body = load_body(context.body_file)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", body)
     legs = legs_share(avatar, body)
+    gated = not bool(avatar.active.all())
+    idle = idle_settings(settings, motion_source(settings.motion).kind, gated)
+    for sentence in idle:
+        context.log(sentence)
     animation = make_animation(context, avatar, body, legs)
     start = time.monotonic()
     actor = ready_actor(context, avatar, animation)
@@ -57,7 +62,7 @@ def run(context: Context) -> None:
     cameras = frame_cameras(context, animation, actor, body)
     draw_animation(context, animation, actor, cameras)
     write_cameras(context.output / "cameras.parquet", dict(enumerate(cameras)))
-    write_json(context.output / "animate.json", summary(settings, animation, actor, legs))
+    write_json(context.output / "animate.json", summary(settings, animation, actor, legs, idle))
     log_result(context, animation, len(actor))
 
 
@@ -185,7 +190,9 @@ class _Timer:
         self.last = now
 
 
-def summary(settings: AnimateSettings, animation: Animation, actor: Actor, legs: float) -> dict[str, Any]:
+def summary(
+    settings: AnimateSettings, animation: Animation, actor: Actor, legs: float, idle: tuple[str, ...]
+) -> dict[str, Any]:
     """The content of ``animate.json``. Times, which differ between equal runs, are in ``run.json``."""
     motion = animation.motion
     found: dict[str, Any] = {
@@ -198,6 +205,7 @@ def summary(settings: AnimateSettings, animation: Animation, actor: Actor, legs:
         "background": settings.background,
         "unseen": "base" if actor.extra is not None else "nothing",
         "heads": settings.heads,
+        "without_effect": list(idle),
     }
     if motion is not None:
         still = in_place(settings, legs)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from pipeline.config.choices import Up
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
 from stages.animate.motions.source import TURNTABLE, motion_source
@@ -60,8 +61,8 @@ class AnimateSettings:
         "where the clip showed nothing: nothing, base (the fitted body in the colours next to it), "
         "auto: as it was trained (train.unseen)",
     )
-    up: Literal["auto", "y", "z"] = setting(
-        "auto", "the axis that is up in an .npz; auto: the one along which its body stands"
+    up: Up = setting(
+        "auto", "the axis that is up in a .bvh or an .npz; auto: the one along which its body stands"
     )
     background: ColorName | HexColor = setting(
         "grey", "behind the video's person; OpenEXR has an alpha instead"

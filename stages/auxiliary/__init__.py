@@ -5,11 +5,18 @@ from stages.auxiliary.settings import AuxiliarySettings
 
 STAGE = Stage(
     name="auxiliary",
-    version=2,
+    version=3,
     settings=AuxiliarySettings,
     run="stages.auxiliary.run:run",
     needs={
-        "ingest": ("frames/*", "masks/*", "cameras.parquet", "keypoints.parquet", "split.json"),
+        "ingest": (
+            "frames/*",
+            "masks/*",
+            "foreground/*",
+            "cameras.parquet",
+            "keypoints.parquet",
+            "split.json",
+        ),
         "fit": ("identity.safetensors", "poses.parquet"),
         "plan": ("plan.json",),
     },

@@ -58,7 +58,7 @@ def score_frames(clip: FittedClip) -> list[Score]:
     """Score some training frames, best first."""
     looks = []
     for frame in clip.spread(LOOKED_AT):
-        image, mask = clip.frame(frame), clip.mask(frame)
+        image, mask = clip.colors(frame), clip.mask(frame)
         points = clip.keypoints.whole_body[clip.keypoints.index(frame)]
         facing = max(
             0.0, head_facing(clip, clip.pose(frame), clip.camera(frame), clip.vertices(frame).mean(0))
@@ -123,7 +123,7 @@ def make_reference(
     vertices, joints = pose_frame(clip.body, clip.identity, clip.pose(frame))
     camera = moved_camera(clip, turn, landmarks, frame, joints, vertices)
     width, height = camera.width, camera.height
-    image, mask = clip.frame(frame), clip.mask(frame)
+    image, mask = clip.colors(frame), clip.mask(frame)
     change = _change(clip.cameras[frame], camera)
     warped = cv2.warpAffine(
         image, change, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE

@@ -5,13 +5,14 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=5,
+    version=6,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
         "ingest": (
             "frames/*",
             "masks/*",
+            "foreground/*",
             "cameras.parquet",
             "keypoints.parquet",
             "split.json",

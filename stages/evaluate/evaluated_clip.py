@@ -26,9 +26,11 @@ class EvaluatedClip(FittedClip):
 
     Attributes:
         trained: poses of training frames.
+        photographed: the truth has the photograph's colours in the mask's soft edge, not the person's own.
     """
 
     trained: Poses
+    photographed: bool = False
 
     def pose(self, frame: int) -> Pose:
         """The pose that a frame is rendered in.
@@ -42,7 +44,11 @@ class EvaluatedClip(FittedClip):
 
     def person(self, frame: int, background: str = BLACK) -> Tensor:
         """The person on a background, [H, W, 3] float32 in [0, 1]."""
-        return composite_frame(self.frame(frame), self.mask(frame), background)
+        return composite_frame(self.true_colors(frame), self.mask(frame), background)
+
+    def true_colors(self, frame: int) -> np.ndarray:
+        """The colours that every picture is compared with, [H, W, 3] uint8 RGB."""
+        return self.frame(frame) if self.photographed else self.colors(frame)
 
     def points(self, frame: int) -> np.ndarray | None:
         """The frame's 133 whole-body points with scores, [133, 3]; None where none were looked for."""
@@ -80,16 +86,21 @@ class EvaluatedClip(FittedClip):
         return {frame: place for place, frame in enumerate(sorted(self.cameras))}
 
 
-def read_evaluated_clip(inputs: Mapping[str, Path], body: BodyModel | Path) -> EvaluatedClip:
+def read_evaluated_clip(
+    inputs: Mapping[str, Path], body: BodyModel | Path, photographed: bool = False
+) -> EvaluatedClip:
     """Reads what the upstream stages published.
 
     Args:
         inputs: the folders of ingest, fit and train.
         body: the body model that the clip was fitted with, or its file.
+        photographed: see ``EvaluatedClip``.
 
     Raises:
         UserError: a file is missing or damaged.
     """
     fitted = read_fitted_clip(inputs["ingest"], inputs["fit"], body)
     parts = {field.name: getattr(fitted, field.name) for field in dataclasses.fields(fitted)}
-    return EvaluatedClip(**parts, trained=read_poses(inputs["train"] / "poses.parquet"))
+    return EvaluatedClip(
+        **parts, trained=read_poses(inputs["train"] / "poses.parquet"), photographed=photographed
+    )

@@ -31,7 +31,8 @@ from pipeline.body import (
 from pipeline.body.rasterize import Raster
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame
-from pipeline.clip.frames import read_frame, read_mask, spread_end_to_end
+from pipeline.clip.foreground import read_person
+from pipeline.clip.frames import read_frame, spread_end_to_end
 from pipeline.clip.records import read_cameras
 from pipeline.metrics.psnr import psnr
 from pipeline.metrics.regions import interior, person
@@ -118,8 +119,10 @@ def score_other_cameras(
         for frame in spread_end_to_end([frame for frame in sorted(cameras) if frame in clip.cameras], FRAMES):
             camera = cameras[frame]
             unseen = true.unseen_pixels(camera, frame) if true is not None else None
-            mask = read_mask(folder / "masks", frame)
-            truth = partial(composite_frame, read_frame(folder / "frames", frame), mask)
+            colors, mask = read_person(folder, frame)
+            if clip.photographed:
+                colors = read_frame(folder / "frames", frame)
+            truth = partial(composite_frame, colors, mask)
             for method in methods:
                 values = camera_metrics(method.render(frame, camera), truth, mask, unseen, background)
                 for metric, value in values.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,7 +18,9 @@ from pipeline.clip.curves import read_curve
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.plan import EFFECTS, Plan, read_plan
 from pipeline.clip.records import write_json
+from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
+from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
@@ -65,6 +68,7 @@ from stages.evaluate.test_pose_refinement import (
     write_refined,
 )
 from stages.evaluate.textured_mesh import TexturedMesh, textured_mesh
+from stages.evaluate.turned import SeenSurface, Turned, look_around, seen_surface
 from stages.evaluate.upstream import (
     GateRecord,
     StageRecord,
@@ -89,7 +93,8 @@ def run(context: Context) -> None:
     """
     settings: EvaluateSettings = context.settings
     start = time.monotonic()
-    clip = read_evaluated_clip(context.inputs, context.body_file)
+    photographed = settings.choices.edge_colors == PHOTOGRAPH
+    clip = read_evaluated_clip(context.inputs, context.body_file, photographed)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
@@ -106,6 +111,7 @@ def run(context: Context) -> None:
         if settings.identity
         else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
+        surface=seen_surface(avatar),
         start=start,
     )
 
@@ -148,6 +154,7 @@ def evaluate(
     second: SecondMask | None = None,
     embedder: FaceEmbedder | None = None,
     other_cameras: Sequence[TableRow] = (),
+    surface: SeenSurface | None = None,
     start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
@@ -162,6 +169,7 @@ def evaluate(
         second: the second masks, where the ceiling is measured.
         embedder: of faces, where they are compared.
         other_cameras: scores in cameras that are not the clip's.
+        surface: of the Gaussians, if they are to be looked at from all sides.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
@@ -181,13 +189,27 @@ def evaluate(
     cover = write_pictures(context, avatar, relaxed, comparisons)
     summary = summarise(context, clip, table, scorer, nearest.nearest, refined, gate, second)
     summary["gaussians"] = len(relaxed)
+    turned = turn(context, relaxed, surface)
+    summary["turned"] = None if turned is None else turned.numbers
     summary["verdict"] = verdict(summary, clip_coverage(context, plan, gate))
     write_json(context.output / "summary.json", summary)
     contents = report_contents(
         context, clip, summary, table, comparisons, cover, (plan, refined, gate), time.monotonic() - start
     )
+    contents = dataclasses.replace(contents, turned=turned)
     write_report(context.output / "report.html", contents)
     show_summary(summary, shown(report_place(context.output)))
+
+
+def turn(context: Context, relaxed: Gaussians, surface: SeenSurface | None) -> Turned | None:
+    """The avatar from all sides; the back of the head is searched for a face where MediaPipe is at hand."""
+    if surface is None:
+        return None
+    start, asset = time.monotonic(), context.assets.get("mediapipe")
+    finder = None if asset is None else FaceFinder(asset, context.work / "mediapipe.log")
+    turned = look_around(relaxed, surface, finder)
+    context.timing("turned_seconds", time.monotonic() - start)
+    return turned
 
 
 def score(

@@ -61,7 +61,7 @@ class SecondMask:
 
     def render(self, frame: int) -> OnBackground:
         """The true frame under its second mask."""
-        return partial(composite_frame, self.clip.frame(frame), self.masks[frame])
+        return partial(composite_frame, self.clip.true_colors(frame), self.masks[frame])
 
 
 def no_second_mask(clip: EvaluatedClip) -> SecondMask:

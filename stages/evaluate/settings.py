@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from pipeline.config import evaluation_protocol as protocols
-from pipeline.config.choices import Background, LpipsNetwork, ProtocolName, Refinement, RenderMask
+from pipeline.config.choices import Background, EdgeColors, LpipsNetwork, ProtocolName, Refinement, RenderMask
 from pipeline.config.evaluation_protocol import Protocol
 from pipeline.config.settings import (
     SETTINGS,
@@ -35,7 +35,7 @@ Auto = Literal["auto"]
 class EvaluateSettings:
     """Settings of the evaluate stage; frames of which there are several are evenly spaced."""
 
-    # Sets of the three choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
+    # Sets of the four choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
     # poses refined), paper_black TalkShow's and ZJU-MoCap's (black, the truth's mask on both).
     protocol: ProtocolName = setting(
         "ours", "a named set of choices, see pipeline/config/evaluation_protocol.py"
@@ -48,6 +48,11 @@ class EvaluateSettings:
     )
     refine_test_poses: Literal[Auto, Refinement] = setting(
         "auto", "score held-out frames at poses refined on them too; plan: as it decided"
+    )
+    edge_colors: Literal[Auto, EdgeColors] = setting(
+        "auto",
+        "the truth's colours where its mask is soft: the person's own, or the photograph's, wall and all; "
+        "auto: as the protocol says",
     )
     refine_steps: Rounds = setting(60, "steps of that refinement, a frame")
     lpips_networks: tuple[LpipsNetwork, ...] = setting(

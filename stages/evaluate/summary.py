@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.config.evaluation_protocol import PROTOCOLS, TRUTH, Protocol
+from pipeline.config.evaluation_protocol import PHOTOGRAPH, PROTOCOLS, TRUTH, Protocol
 from pipeline.metrics import EROSION
 from pipeline.run.stage import Context
 from stages.evaluate.evaluated_clip import EvaluatedClip
@@ -95,10 +95,15 @@ def _composited(choices: Protocol) -> list[str]:
         if choices.render_mask == TRUTH
         else "The truth is cut out by its mask, the avatar by its own alpha."
     )
+    photograph = choices.edge_colors == PHOTOGRAPH
+    colors = (
+        "the photograph's, background and all" if photograph else "the person's own, as ingest found them"
+    )
     return [
         f"The person is composited on {choices.background}, in every picture alike, and compared over the "
         "whole image at the stored size; each number is a mean over frames.",
         cut,
+        f"Where the truth's mask is soft its colours are {colors}.",
         "PSNR is in dB; person is the mask (alpha above 0.5), inside the mask eroded by "
         f"{EROSION} px, both on black whatever the rest is on.",
     ]

@@ -26,6 +26,8 @@ CLEAR = 1.0  # dB under which a cause is not worth naming
 NEAR_CEILING = 2.0  # dB between avatar and ceiling, under which masks are what is measured
 PARTS = 3.0  # dB by which a part must be worse than the whole person to be named
 NAMED = 2  # causes
+HOLES = 0.5  # percent of the silhouette, from which holes are named
+SPECKLE = 1.2  # of guessed over seen surface, from which it is named
 
 _OVER = {NEAREST: "copying the nearest training frame", MESH: "the textured mesh"}
 
@@ -46,14 +48,21 @@ class ClipCoverage:
 
 
 def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
-    """Two or three sentences.
+    """Two to four sentences.
 
     Args:
         summary: what ``summary.json`` holds.
         coverage: of the person by the clip.
     """
     return [
-        sentence for sentence in (quality(summary), limits(summary, coverage), turned(coverage)) if sentence
+        sentence
+        for sentence in (
+            quality(summary),
+            limits(summary, coverage),
+            turned(coverage),
+            worst_side(summary.get("turned")),
+        )
+        if sentence
     ]
 
 
@@ -133,6 +142,24 @@ def turned(coverage: ClipCoverage) -> str:
         back = f"{count} were never filmed, the back among them: there it is a guess"
         return f"Turned: {back}; {hollow}." if coverage.unmodelled >= 0.01 else f"Turned: {back}."
     return f"{hollow}." if coverage.unmodelled >= 0.01 else ""
+
+
+def worst_side(numbers: Mapping[str, Any] | None) -> str:
+    """The worst of what is wrong where the avatar is turned; empty where nothing is, or nobody looked.
+
+    Args:
+        numbers: those of ``stages.evaluate.turned.Turned``.
+    """
+    if numbers is None:
+        return ""
+    if numbers["face_behind"]:
+        return "Turned round, a face is found where the back of the head is."
+    holes, speckle = 100 * numbers["holes"], numbers["speckle"]
+    if holes >= HOLES:
+        return f"Turned round, it has holes: {holes:.1f}% of its silhouette lets light through."
+    if speckle is not None and speckle >= SPECKLE:
+        return f"Turned round, what no frame showed is {speckle:.1f} times as speckled as the rest."
+    return ""
 
 
 def _best_baseline(summary: Mapping[str, Any]) -> tuple[str | None, Mapping[str, float] | None]:

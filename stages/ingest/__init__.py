@@ -5,7 +5,7 @@ from stages.ingest.settings import IngestSettings
 
 STAGE = Stage(
     name="ingest",
-    version=3,
+    version=4,
     settings=IngestSettings,
     run="stages.ingest.run:run",
     assets=lambda settings: ("mediapipe",) if settings.uses_estimator else (),

@@ -22,6 +22,7 @@ from stages.ingest.cameras.distortion import undistort_frames
 from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, join_poses
 from stages.ingest.detect import DetectedClip, detect
 from stages.ingest.external_detections import open_sources
+from stages.ingest.foreground import write_foreground
 from stages.ingest.masks import publish_given_masks, refine_masks
 from stages.ingest.video import Clip
 
@@ -91,6 +92,9 @@ def ingest_shot(
     detected = apply_cameras(output, detected, chosen)
     check_enough(clip, detected, least)
     frames = detected.keypoints.frames.tolist()
+    began = time.perf_counter()
+    write_foreground(output, frames, settings.background)
+    timings["foreground_seconds"] = time.perf_counter() - began
     poses = None if shot.poses is None else on_frames(shot.poses, frames)
     cameras = {frame: chosen.cameras[frame] for frame in frames}
     return Ingested(detected, cameras, chosen.record, sources.names, poses, timings)

@@ -121,13 +121,20 @@ def gaussian_pixels(inputs: PlanInputs) -> float:
     frames = clip.spread(LOOKED_AT)
     poses = clip.poses.select(frames)
     vertices, _ = pose_body(clip.body, clip.identity, poses.rotation, poses.expression, poses.transl)
-    found = [_spacing(seen, clip.body.faces, cameras[f]) for seen, f in zip(vertices, frames, strict=True)]
+    faces = clip.body.faces
+    found = [vertex_spacing(seen, faces, cameras[f]) for seen, f in zip(vertices, frames, strict=True)]
     shown = [one for one in found if one > 0]
     return float(np.mean(shown)) if shown else 0.0
 
 
-def _spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
-    """The distance in one frame; 0 if no face of the mesh is seen. vertices [V, 3] world, faces [F, 3]."""
+def vertex_spacing(vertices: Tensor, faces: Tensor, camera: Camera) -> float:
+    """The distance of neighbouring vertices in a picture, pixels; 0 if no face of the mesh is seen.
+
+    Args:
+        vertices: [V, 3], world.
+        faces: [F, 3], corners to the left seen from outside.
+        camera: of the picture.
+    """
     pixels, depth = project(camera, vertices), to_camera(camera, vertices)[:, 2]
     corners = pixels[faces.long()]  # [F, 3, 2]
     middle = corners.mean(1)

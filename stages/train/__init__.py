@@ -5,11 +5,11 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=5,
+    version=6,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={
-        "ingest": ("frames/*", "masks/*", "cameras.parquet", "split.json", "footage.json"),
+        "ingest": ("frames/*", "masks/*", "foreground/*", "cameras.parquet", "split.json", "footage.json"),
         "fit": ("identity.safetensors", "poses.parquet"),
         "plan": ("plan.json",),
         "auxiliary": (

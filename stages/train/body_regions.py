@@ -76,6 +76,12 @@ def find_regions(canonical: Canonical, weights: Mapping[str, PartWeights], arms:
     )
 
 
+def weighted_by(regions: Regions, factors: Mapping[str, Tensor]) -> Regions:
+    """The regions with the weights of some terms multiplied by a factor for each vertex, [N, 1]."""
+    changed = {name: regions.weights[name] * factor for name, factor in factors.items()}
+    return dataclasses.replace(regions, weights={**regions.weights, **changed})
+
+
 def weight_by_part(canonical: Canonical, hands: float, face: float, elsewhere: float) -> Tensor:
     """A weight for each vertex by its body part, [N, 1]."""
     values = torch.full((len(canonical), 1), elsewhere, device=canonical.vertices.device)

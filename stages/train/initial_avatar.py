@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.completion import complete_color_logits
 from pipeline.avatar.density import DENSITY_FRAMES, choose_splits, project_surface
 from pipeline.avatar.driving_signal import fit_driving_signal, signal_features
 from pipeline.clip.frames import spread_from_start
@@ -17,10 +18,12 @@ from pipeline.device import moved
 from pipeline.errors import UserError
 from pipeline.finite import require_finite
 from stages.train.data import TrainingData
-from stages.train.initial_colors import initial_color_logits
+from stages.train.frame_evidence import evidence_of
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
 from stages.train.visibility_gate import ever_in_frame
+
+FRAMES_A_BASIS = 8  # training frames for one more: with fewer it learns the clip by heart
 
 
 def initial_avatar(
@@ -56,7 +59,9 @@ def initial_avatar(
     avatar.representation.set_clip(moved(conditions, avatar.device))
     if settings.initial_color or settings.face:
         captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
-        logits = initial_color_logits(avatar.eval(), refinement, data, captured, made)
+        evidence = evidence_of(avatar.eval(), refinement, data, captured, made)
+        avatar.trust.copy_(evidence.together)
+        logits = complete_color_logits(avatar.surface(), evidence)
         if settings.face:
             data = dataclasses.replace(data, texture=torch.sigmoid(logits))
         if settings.initial_color:
@@ -136,7 +141,8 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
         return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
     remembered |= {"plane_resolution": 2, "plane_channels": 1}  # there are no planes
     features = signal_features(conditions.theta, conditions.expression, expressions)
-    bases = len(fit_driving_signal(features, settings.bases))
+    few_frames = max(1, len(features) // FRAMES_A_BASIS)
+    bases = len(fit_driving_signal(features, min(settings.bases, few_frames)))
     return Architecture(**remembered, pose_heads=bases > 0, bases=bases)
 
 

@@ -167,14 +167,16 @@ class Trainer:
 
     def _require_finite_gradients(self) -> None:
         """Refuses gradients that are not finite: a finite loss may have them, and Adam would spread them."""
-        found = [
-            (f"{prefix}.{name}", weight.grad)
-            for prefix, module in self._modules().items()
-            for name, weight in module.named_parameters()
-            if weight.grad is not None
-        ]
-        if not finite(gradient for _, gradient in found):
-            named = {f"the gradient of {name}": gradient for name, gradient in found}
+        optimizers = (self._avatar_optimizer, self._pose_optimizer)
+        groups = [group for optimizer in optimizers for group in optimizer.param_groups]
+        found = [weight.grad for group in groups for weight in group["params"] if weight.grad is not None]
+        if not finite(found):  # names are asked for only then: there is a pose for every frame
+            named = {
+                f"the gradient of {prefix}.{name}": weight.grad
+                for prefix, module in self._modules().items()
+                for name, weight in module.named_parameters()
+                if weight.grad is not None
+            }
             require_finite(named, "training", self._where, self._remedy)
 
     @property

@@ -75,10 +75,21 @@ def scale_growth(
 ) -> Tensor:
     """The squared growth of log scales beyond their initial values, [N, 3].
 
-    Shrinking has no penalty: one on the scale itself shrinks Gaussians that no frame shows, and leaves gaps
-    in views that training never had.
+    It is not taken of the scale itself: that would shrink Gaussians that no frame shows, and leave gaps in
+    views that training never had.
     """
     return log_scale.clamp_min(0).square()
+
+
+def scale_shrink(
+    log_scale: Tensor,  # [N, 3]
+) -> Tensor:
+    """The squared fall of log scales below their initial values, at which neighbours just cover, [N, 3].
+
+    A Gaussian that is seen from its edge, or lies outside the mask, could otherwise vanish by shrinking, and
+    the surface is a sieve from any other side. With it such a Gaussian moves.
+    """
+    return log_scale.clamp_max(0).square()
 
 
 def outward_offset(

@@ -25,13 +25,16 @@ from pipeline.device import moved
 from pipeline.metrics import Lpips, ssim_loss
 from pipeline.splat import render
 from stages.train import losses, schedule
-from stages.train.body_regions import PartWeights, Regions, find_regions
+from stages.train.body_regions import PartWeights, Regions, find_regions, weighted_by
 from stages.train.data import TrainingData
 from stages.train.frame_visibility_cache import FrameVisibilityCache
+from stages.train.laplacian_kernel import mean_laplacian
 from stages.train.poses import PoseRefinement
 from stages.train.rendered_frame import RenderedFrame, StaticAvatar
 from stages.train.schedule import Draw
 from stages.train.settings import TrainSettings
+
+TRUST = {"color": 0, "shape": 1}  # columns of ``Avatar.trust``
 
 Source = TypeVar("Source", StaticAvatar, RenderedFrame)
 Terms = dict[str, Tensor]
@@ -47,6 +50,8 @@ class Term(Generic[Source]):
         of: its arguments; the term is left out where one of them is None.
         weight: the setting that weighs it.
         hands, face: the settings that weigh it on these parts instead, a vertex at a time.
+        smooths: it counts more, a vertex at a time, where evidence of what it smooths is weak: "color" or
+            "shape"; not at all differently if empty.
         generated: the setting that weighs it on generated frames instead.
         captured_only: it is not taken of generated frames.
         since: the setting with the fraction of the run from which it takes part; from the start if empty.
@@ -62,6 +67,7 @@ class Term(Generic[Source]):
     weight: str
     hands: str = ""
     face: str = ""
+    smooths: str = ""
     generated: str = ""
     captured_only: bool = False
     since: str = ""
@@ -121,16 +127,18 @@ FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
          since="lpips_from", every="lpips_every"),
     # L_reg of what is rendered, by body part (Section 3.6; ExAvatar)
     Term("laplacian_scale", losses.laplacian, lambda f: (f.posed.log_scale, f.neighbours),
-         "laplacian_scale", face="laplacian_scale_face", mask=lambda f: f.unmixed),
+         "laplacian_scale", face="laplacian_scale_face", smooths="shape", mask=lambda f: f.unmixed),
     Term("laplacian_color", losses.laplacian, lambda f: (f.colors, f.neighbours),
-         "laplacian_color", hands="laplacian_color_hands", mask=lambda f: f.unmixed),
+         "laplacian_color", hands="laplacian_color_hands", smooths="color", mask=lambda f: f.unmixed),
     Term("scale_size", losses.l2, lambda f: (f.posed.gaussians.scales,),
          "scale_size", hands="scale_size_hands"),
+    Term("scale_shrink", losses.scale_shrink, lambda f: (f.posed.log_scale,), "scale_shrink"),
     Term("scale_growth", losses.scale_growth, lambda f: (f.posed.log_scale,), "scale_growth"),
     Term("hand_color", losses.color_variance, lambda f: (f.regions.on_hands(f.colors),), "hand_color"),
     Term("arm_color", losses.l2, lambda f: (f.underside_contrast,), "arm_color"),
     Term("laplacian_pose_offset", losses.laplacian, lambda f: (f.offset, f.neighbours),
-         "laplacian_offset", face="laplacian_offset_face", since="pose_heads_from", mask=lambda f: f.unmixed),
+         "laplacian_offset", face="laplacian_offset_face", smooths="shape", since="pose_heads_from",
+         mask=lambda f: f.unmixed),
     Term("pose_offset", losses.l2, lambda f: (f.posed.pose_offset,), "pose_offset", since="pose_heads_from"),
     Term("residual_size", losses.l2, lambda f: (f.posed.color_residual,), "residual_size",
          since="residual_from"),
@@ -143,7 +151,7 @@ FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
 )
 STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
     Term("laplacian_offset", losses.laplacian, lambda s: (s.decoded.offset, s.neighbours),
-         "laplacian_offset", face="laplacian_offset_face"),
+         "laplacian_offset", face="laplacian_offset_face", smooths="shape"),
     Term("offset", losses.l2, lambda s: (s.decoded.offset,), "offset", hands="offset_hands",
          face="offset_face"),
     Term("hand_normal", losses.outward_offset,
@@ -274,7 +282,7 @@ class TrainingObjective:
         for term in terms:
             if not term.takes_part(self.settings, iteration, position, generated):
                 continue
-            mean = _reduced(term, source)
+            mean = _reduced(term, source, self.avatar.architecture.representation == "bases")
             if mean is not None:
                 found[term.name] = term.scalar_weight(self.settings, generated) * mean
         return found
@@ -284,17 +292,28 @@ class TrainingObjective:
         if self._last_regions is None or self._last_regions[0] is not surface:
             by_part = {term.name: term.part_weights(self.settings) for term in TERMS if term.by_part}
             arms = bool(self.settings.arm_color)
-            self._last_regions = surface, find_regions(surface.canonical, by_part, arms)
+            regions = find_regions(surface.canonical, by_part, arms)
+            doubt = 1 + self.settings.weak_smoothness * (1 - surface.pick(self.avatar.trust))
+            factors = {term.name: doubt[:, TRUST[term.smooths], None] for term in TERMS if term.smooths}
+            self._last_regions = surface, weighted_by(regions, factors)
         return self._last_regions[1]
 
 
-def _reduced(term: Term[Source], source: Source) -> Tensor | None:
-    """The mean of a term's loss, weighted by its mask and by body part; None where an operand is missing."""
+def _reduced(term: Term[Source], source: Source, at_once: bool) -> Tensor | None:
+    """The mean of a term's loss, weighted by its mask and by body part; None where an operand is missing.
+
+    Args:
+        term: a row of the table.
+        source: of its operands.
+        at_once: Laplacians in one pass. A triplane's are not: its published bytes would change.
+    """
     operands = term.of(source)
     if any(operand is None for operand in operands):
         return None
     weight, mask = source.regions.weights.get(term.name), term.mask(source) if term.mask else None
     if mask is not None:
         weight = mask if weight is None else mask * weight
+    if at_once and term.loss is losses.laplacian:
+        return mean_laplacian(*operands, weight)
     count = term.count(source) if term.count else None
     return losses.weighted_mean(term.loss(*operands), weight, count)

@@ -13,7 +13,8 @@ from pipeline.body import BodyModel, Identity, draw_mesh, rest_vertices, write_p
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.curves import Curve
 from pipeline.clip.frames import write_png
-from stages.train.initial_colors import color_unseen
+from stages.train.frame_evidence import settle_unseen
+from stages.train.gated_colors import color_unseen
 from stages.train.loop import Trainer
 from stages.train.visibility_gate import VisibilityGate, write_ungated
 
@@ -33,6 +34,7 @@ def publish(trainer: Trainer, curve: Curve, gate: VisibilityGate | None, output:
     avatar, clip = trainer.avatar, trainer.data.clip
     ever_visible = trainer.objective.visibility_cache.ever_visible(len(avatar.base_color))
     avatar.representation.forget_unseen(ever_visible)
+    settle_unseen(avatar, trainer.poses, trainer.data, trainer.settings)
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
         color_unseen(avatar)

@@ -19,10 +19,12 @@ from stages.train.settings import TrainSettings
 
 FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP, SOURCE = 1, 2, 3, 4, 5, 6  # purposes
 
-# Costs in Gaussians' static heads, read off runs of `smile`, in which the second half, subdivided and with
-# all heads, takes four times as long as the first steps. They matter only until a phase has been measured.
+# Costs in Gaussians' static heads, read off runs of `smile`: of a triplane, subdivided and with all heads, a
+# step takes five times as long as the first ones. They matter only until a phase has been measured.
 PICTURE_COST = 6000.0  # rendering and comparing
+LPIPS_COST = 5000.0
 POSE_HEADS_COST, RESIDUALS_COST = 1.0, 0.1  # of what the static heads take
+BASES_COST = 0.15  # of the same
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,10 +81,14 @@ def step_costs(settings: TrainSettings, gaussians: Sequence[int]) -> list[float]
 
     def cost(iteration: int) -> float:
         fine = reached(settings, settings.subdivide_from, iteration)
+        lpips = bool(settings.lpips) and begun(settings, settings.lpips_from, iteration)
+        picture = PICTURE_COST + LPIPS_COST / settings.lpips_every * lpips
+        if settings.representation == "bases":
+            return picture + BASES_COST * gaussians[-1]
         heads = 1.0
         heads += POSE_HEADS_COST * begun(settings, settings.pose_heads_from, iteration)
         heads += RESIDUALS_COST * begun(settings, settings.residual_from, iteration)
-        return PICTURE_COST + heads * gaussians[-1 if fine else 0]
+        return picture + heads * gaussians[-1 if fine else 0]
 
     return [cost(iteration) for iteration in range(settings.iterations)]
 

@@ -86,9 +86,11 @@ class TrainSettings:
     representation: Literal["bases", "triplane"] = setting(
         "bases", "each Gaussian's own parameters and bases, or the paper's triplane and heads"
     )
-    # A prototype on smile: 35.8, 36.5 and 35.9 dB with 0, 8 and 16; more learn the clip by heart.
+    # smile (65 frames) lost 0.1 dB with 16 of them, carphone (108) gained 0.8 over 8 (docs/results.md).
     bases: BasesCount = setting(
-        8, "most linear bases, driven by pose and face; less where the clip moves in fewer ways"
+        16,
+        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction that "
+        "the clip does not move in",
     )
     edge_pixels: EdgePixels | None = setting(
         None,
@@ -151,10 +153,10 @@ class TrainSettings:
         None, "scores below are gated; none: found in the scores (Otsu)"
     )
     gate_rings: Rings = setting(2, "rings of neighbours added to what is left")
-    unseen: Literal["nothing", "base", "generated"] = setting(
-        "generated",
-        "where no captured frame showed enough: nothing, base (the fitted body in the colours next to it), "
-        "or what generated frames show, and nothing where there are none",
+    unseen: Literal["completed", "generated", "base", "nothing"] = setting(
+        "completed",
+        "where no frame showed enough: completed from what frames showed of hair, cloth and skin; generated, "
+        "as training left it; nothing; base, completed, and what the gate took as the fitted body",
     )
 
     # Optimiser
@@ -200,6 +202,10 @@ class TrainSettings:
     scale_size: Weight = setting(0.0, "size of scales, metres squared")
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
+    scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
+    weak_smoothness: Weight = setting(
+        10.0, "times more that smoothness counts where no frame showed enough, continuously"
+    )
     hand_color: Weight = setting(0.0, "differences of the hands' colours from their mean")
     arm_color: Weight = setting(0.0, "differences of the arms' lower sides from their upper sides")
     residual_size: Weight = setting(1e-3, "size of residual colours, in logits")

@@ -142,7 +142,7 @@ class VisibilityGate(nn.Module, Hook):
         captured, generated = self.hits_at_threshold / self.drawn_at_threshold.clamp_min(1)[:, None]
         threshold = self._find_threshold(self.whole_body(captured))
         active = captured >= threshold.tau
-        if self._settings.unseen == "generated":
+        if self._settings.unseen in ("completed", "generated"):
             active |= (generated >= threshold.tau) & (self.drawn_at_threshold[GENERATED] > 0)
         if threshold.closed and not bool(active.any()):
             why = f"a line at {threshold.tau:.2f} would gate all of the body, so none is drawn"

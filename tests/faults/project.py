@@ -84,7 +84,7 @@ def toy_project(root: Path) -> Project:
     """Stages that only count, a second each: for many kills in little time."""
     from tests.pipeline.conftest import ToyProject
 
-    toy = ToyProject(root)
+    toy = ToyProject(root).write()
     words = ("subject=ann", "paint.iterations=8", "paint.rate=0.02", *toy.words())
     return Project(words, "ann", ("gather", "bend", "paint"), toy.store)
 

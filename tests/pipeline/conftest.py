@@ -1,4 +1,5 @@
 import os
+import shutil
 import subprocess
 import sys
 
@@ -14,6 +15,10 @@ class ToyProject:
     def __init__(self, root):
         self.root = root
         self.data = root / "data"
+        self.store = self.data / "artifacts"
+
+    def write(self):
+        """Write the data folder."""
         for folder in ("subjects", "presets", "datasets", "body", "sources"):
             (self.data / folder).mkdir(parents=True)
         (self.data / "assets.toml").write_text("")
@@ -23,7 +28,7 @@ class ToyProject:
         for name in ("ann", "bob"):
             self.subject(name, f'title = "{name}"\n[source]\npath = "sources/{name}.txt"\n')
             (self.data / "sources" / f"{name}.txt").write_text(f"{name} ")
-        self.store = self.data / "artifacts"
+        return self
 
     def subject(self, name, text):
         (self.data / "subjects" / f"{name}.toml").write_text(text)
@@ -70,4 +75,20 @@ class ToyProject:
 
 @pytest.fixture
 def toy(tmp_path):
-    return ToyProject(tmp_path)
+    return ToyProject(tmp_path).write()
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    """A project in which ann was made; read only."""
+    toy = ToyProject(tmp_path_factory.mktemp("finished")).write()
+    assert toy.doit("subject=ann").returncode == 0
+    toy.ran()
+    return toy
+
+
+@pytest.fixture
+def made(finished, tmp_path):
+    """The same elsewhere, for a test to go on from: nothing in a store depends on where it lies."""
+    shutil.copytree(finished.root, tmp_path / "project", symlinks=True)
+    return ToyProject(tmp_path / "project")

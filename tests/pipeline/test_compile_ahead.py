@@ -21,7 +21,7 @@ import sys
 from pathlib import Path
 from pipeline.run.compile_timer import compile_timer
 from stages.train import run
-from tests.stages.train_subject import context_for
+from tests.made.portrait import context_for
 with compile_timer() as compiled:
     context = context_for(Path(sys.argv[1]), Path(sys.argv[2]), iterations=2, representation=sys.argv[3])
     run.run(context)
@@ -136,11 +136,8 @@ def test_one_that_fails_says_so_in_a_line_and_spoils_nothing(cache):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("representation", ["bases", "triplane"])
-def test_training_finds_its_kernels(cache, tmp_path, representation):
-    from tests.stages.train_subject import write_subject
-
-    write_subject(tmp_path / "subject")
+def test_training_finds_its_kernels(cache, subject, tmp_path, representation):
     code = "import sys; from pipeline.run.compile_ahead import compile_and_record as c; c(sys.argv[1])"
     program("-c", code, f"stages.train.compile_ahead:compile_{representation}")
-    said = program("-c", TRAINING_STEP, str(tmp_path / "subject"), str(tmp_path / "out"), representation)
+    said = program("-c", TRAINING_STEP, str(subject), str(tmp_path / "out"), representation)
     assert float(said.split()[-1]) < 0.5

@@ -34,46 +34,36 @@ def test_any_clip_without_a_file_to_write_first(toy):
     assert toy.ran() == ["gather:me", "bend:me", "paint:me"]
 
 
-def test_a_changed_setting_reruns_its_stage_and_what_follows_and_changing_back_runs_nothing(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    toy.doit("subject=ann", "bend.angle=2")
-    assert toy.ran() == ["bend:ann", "paint:ann"]
-    assert (toy.store / "ann" / "paint" / "latest" / "painted.txt").read_text() == "ann 2.0" * 3
-    toy.doit("subject=ann")
-    assert toy.ran() == []
-    assert (toy.store / "ann" / "paint" / "latest" / "painted.txt").read_text() == "ann 1.0" * 3
-    assert len(toy.published("bend", "ann")) == 2
+def test_a_changed_setting_reruns_its_stage_and_what_follows_and_changing_back_runs_nothing(made):
+    made.doit("subject=ann", "bend.angle=2")
+    assert made.ran() == ["bend:ann", "paint:ann"]
+    assert (made.store / "ann" / "paint" / "latest" / "painted.txt").read_text() == "ann 2.0" * 3
+    made.doit("subject=ann")
+    assert made.ran() == []
+    assert (made.store / "ann" / "paint" / "latest" / "painted.txt").read_text() == "ann 1.0" * 3
+    assert len(made.published("bend", "ann")) == 2
 
 
-def test_a_changed_setting_of_the_last_stage_reruns_it_alone(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    toy.doit("subject=ann", "paint.iterations=5")
-    assert toy.ran() == ["paint:ann"]
+def test_a_changed_setting_of_the_last_stage_reruns_it_alone(made):
+    made.doit("subject=ann", "paint.iterations=5")
+    assert made.ran() == ["paint:ann"]
 
 
-def test_an_upstream_rerun_whose_output_is_unchanged_stops_there(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    toy.doit("subject=ann", "gather.unused=9")
-    assert toy.ran() == ["gather:ann"]
+def test_an_upstream_rerun_whose_output_is_unchanged_stops_there(made):
+    made.doit("subject=ann", "gather.unused=9")
+    assert made.ran() == ["gather:ann"]
 
 
-def test_changed_footage_reruns_everything(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    (toy.data / "sources" / "ann.txt").write_text("anna ")
-    toy.doit("subject=ann")
-    assert toy.ran() == ["gather:ann", "bend:ann", "paint:ann"]
+def test_changed_footage_reruns_everything(made):
+    (made.data / "sources" / "ann.txt").write_text("anna ")
+    made.doit("subject=ann")
+    assert made.ran() == ["gather:ann", "bend:ann", "paint:ann"]
 
 
-def test_the_state_that_doit_keeps_may_be_lost(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    (toy.root / ".doit.json").unlink(missing_ok=True)
-    toy.doit("subject=ann")
-    assert toy.ran() == []
+def test_the_state_that_doit_keeps_may_be_lost(made):
+    (made.root / ".doit.json").unlink(missing_ok=True)
+    made.doit("subject=ann")
+    assert made.ran() == []
 
 
 def test_presets_datasets_subjects_and_the_command_line_in_this_order(toy):
@@ -194,26 +184,24 @@ def test_list_and_clean(toy):
     assert (toy.store / "bob" / "paint" / "latest").exists()
 
 
-def test_verify_finds_a_flipped_bit_and_names_the_stage_to_rerun(toy):
-    toy.doit("subject=ann")
-    assert toy.doit("verify:ann").returncode == 0
-    file = toy.store / "ann" / "bend" / "latest" / "bent.txt"
+def test_verify_finds_a_flipped_bit_and_names_the_stage_to_rerun(made):
+    assert made.doit("verify:ann").returncode == 0
+    file = made.store / "ann" / "bend" / "latest" / "bent.txt"
     content = bytearray(file.read_bytes())
     content[0] ^= 1
     file.write_bytes(content)
-    run = toy.doit("verify:ann")
+    run = made.doit("verify:ann")
     said = run.stdout + run.stderr
     assert run.returncode != 0 and "bent.txt" in said and "doit run bend:ann" in said
 
 
-def test_prune_keeps_the_version_in_use(toy):
-    toy.doit("subject=ann")
-    toy.doit("subject=ann", "bend.angle=2")
-    assert toy.doit("prune:ann").returncode == 0
-    assert len(toy.published("bend", "ann")) == 1
-    toy.ran()
-    toy.doit("subject=ann", "bend.angle=2")
-    assert toy.ran() == []
+def test_prune_keeps_the_version_in_use(made):
+    made.doit("subject=ann", "bend.angle=2")
+    assert made.doit("prune:ann").returncode == 0
+    assert len(made.published("bend", "ann")) == 1
+    made.ran()
+    made.doit("subject=ann", "bend.angle=2")
+    assert made.ran() == []
 
 
 def test_a_file_that_a_setting_names_is_known_by_its_content(toy):

@@ -58,6 +58,7 @@ def make(toy, stage, *words):
 # Kills
 
 
+@pytest.mark.slow
 @LINUX
 def test_a_stage_does_not_outlive_the_doit_that_was_killed(toy):
     words = ("subject=ann", "paint.iterations=40", "paint.rate=0.05")
@@ -113,15 +114,14 @@ def test_memory_that_runs_out_in_a_stage_is_one_line(toy):
     assert run.returncode != 0 and "memory ran out" in run.stderr and "Traceback" not in run.stderr
 
 
-def test_a_dangling_latest_is_put_right(toy):
-    toy.doit("subject=ann")
-    link = toy.store / "ann" / "paint" / LATEST
+def test_a_dangling_latest_is_put_right(made):
+    link = made.store / "ann" / "paint" / LATEST
     version = os.readlink(link)
     link.unlink()
     link.symlink_to("0000000000000000")
-    assert Store(toy.store).latest("ann", "paint") is None
-    toy.ran()
-    assert toy.doit("subject=ann").returncode == 0 and toy.ran() == []
+    assert Store(made.store).latest("ann", "paint") is None
+    made.ran()
+    assert made.doit("subject=ann").returncode == 0 and made.ran() == []
     assert os.readlink(link) == version
 
 
@@ -134,20 +134,20 @@ def test_a_latest_that_is_no_link_is_named(toy):
     assert run.returncode != 0 and f"{link}: is not a link" in run.stderr and "Traceback" not in run.stderr
 
 
-def test_what_killed_runs_left_is_pruned(toy):
-    toy.doit("subject=ann")
-    folder = toy.store / "ann" / "bend"
+def test_what_killed_runs_left_is_pruned(made):
+    folder = made.store / "ann" / "bend"
     (folder / ".latest-1a2b").symlink_to(os.readlink(folder / LATEST))
     (folder / ".latest-3c4d").symlink_to("0000000000000000")
     (folder / ".damaged-0-1").mkdir()
     (folder / ".scratch-0").mkdir()
-    assert toy.doit("prune:ann").returncode == 0
-    assert hidden(toy) == [] and len(toy.published("bend", "ann")) == 1
+    assert made.doit("prune:ann").returncode == 0
+    assert hidden(made) == [] and len(made.published("bend", "ann")) == 1
 
 
 # Two at once
 
 
+@pytest.mark.slow
 def test_the_same_subject_twice_at_once(toy):
     words = ("subject=ann", "paint.iterations=40", "paint.rate=0.05")
     both = [start(toy, *words) for _ in range(2)]
@@ -159,6 +159,7 @@ def test_the_same_subject_twice_at_once(toy):
     assert damages(Store(toy.store), "ann", STAGES) == [] and hidden(toy) == []
 
 
+@pytest.mark.slow
 def test_two_runs_share_no_file_that_one_could_find_half_written(toy):
     assert toy.doit("subject=ann").returncode == 0
     beside = {path.name for path in toy.root.iterdir()} | {path.name for path in toy.data.iterdir()}
@@ -173,16 +174,14 @@ def set_times(root, seconds):
         os.utime(path, (seconds, seconds), follow_symlinks=False)
 
 
-def test_nothing_is_stale_by_its_times(toy):
-    toy.doit("subject=ann")
-    toy.ran()
+def test_nothing_is_stale_by_its_times(made):
     for moment in (4102444800, 86400):  # the year 2100, and 1970
-        set_times(toy.data, moment)
-        assert toy.doit("subject=ann").returncode == 0 and toy.ran() == []
-    (toy.data / "sources" / "ann.txt").write_text("eve ")  # of the same size
-    set_times(toy.data, 86400)
-    assert toy.doit("subject=ann").returncode == 0
-    assert toy.ran() == ["gather:ann", "bend:ann", "paint:ann"]
+        set_times(made.data, moment)
+        assert made.doit("subject=ann").returncode == 0 and made.ran() == []
+    (made.data / "sources" / "ann.txt").write_text("eve ")  # of the same size
+    set_times(made.data, 86400)
+    assert made.doit("subject=ann").returncode == 0
+    assert made.ran() == ["gather:ann", "bend:ann", "paint:ann"]
 
 
 def test_seconds_are_right_though_the_clock_is_set_back(toy, monkeypatch):

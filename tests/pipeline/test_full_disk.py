@@ -167,15 +167,13 @@ def test_a_data_folder_that_cannot_be_written(toy):
         assert (elsewhere / "ann" / "paint" / "latest" / "painted.txt").read_text() == "ann 1.0" * 3
 
 
-def test_a_finished_store_can_be_read_where_it_cannot_be_written(toy):
-    toy.doit("subject=ann")
-    toy.ran()
-    (toy.store / ".digests.json").unlink(missing_ok=True)
-    with read_only(toy.store):
-        assert toy.doit("subject=ann").returncode == 0 and toy.doit("verify:ann").returncode == 0
-        assert toy.ran() == []
-        run = toy.doit("subject=ann", "bend.angle=9")
-        assert run.returncode != 0 and "cannot be written" in run.stderr and str(toy.store) in run.stderr
+def test_a_finished_store_can_be_read_where_it_cannot_be_written(made):
+    (made.store / ".digests.json").unlink(missing_ok=True)
+    with read_only(made.store):
+        assert made.doit("subject=ann").returncode == 0 and made.doit("verify:ann").returncode == 0
+        assert made.ran() == []
+        run = made.doit("subject=ann", "bend.angle=9")
+        assert run.returncode != 0 and "cannot be written" in run.stderr and str(made.store) in run.stderr
         assert "Traceback" not in run.stdout + run.stderr
 
 

@@ -86,6 +86,7 @@ assert not any(base.run(one).failure for one in (Variant("one"), Variant("two", 
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_a_study_killed_outright_goes_on_where_it_was(toy):
     line = [sys.executable, "-c", STUDY, str(toy.data), str(toy.root / "log.txt")]

@@ -129,13 +129,12 @@ def test_a_damaged_version_of_other_settings_is_told_apart(toy):
     assert damages(Store(toy.store), "ann", ["bend"]) == []
 
 
-def test_a_flipped_bit_in_an_upstream_record_does_not_mislead_about_what_follows(toy):
-    toy.doit("subject=ann")
-    manifest = toy.store / "ann" / "bend" / LATEST / "manifest.json"
+def test_a_flipped_bit_in_an_upstream_record_does_not_mislead_about_what_follows(made):
+    manifest = made.store / "ann" / "bend" / LATEST / "manifest.json"
     digest = manifest.read_text().index('"sha256": "') + len('"sha256": "')
     flip(manifest, digest, 0)  # still a manifest, of another file
-    flip(toy.store / "ann" / "paint" / LATEST / "painted.txt", 0, 0)
-    found = toy.doit("verify:ann")
+    flip(made.store / "ann" / "paint" / LATEST / "painted.txt", 0, 0)
+    found = made.doit("verify:ann")
     said = found.stdout + found.stderr
     assert "rerun the stage: doit run bend:ann" in said and "rerun the stage: doit run paint:ann" in said
 

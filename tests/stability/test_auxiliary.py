@@ -10,9 +10,10 @@ from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.records import Split, read_cameras, write_split
 from pipeline.errors import UserError
 from pipeline.texture import robust_mean, weighted_median
+from pipeline.texture.completion import shading
+from pipeline.texture.membrane import neighbours, screened_membrane
 from stages.auxiliary import run as stage
-from stages.auxiliary.texture_generator import membrane, neighbours, shading
-from tests.stages.auxiliary_subject import FRAMES, context_for, write_clip
+from tests.made.mannequin_clip import FRAMES, context_for, write_clip
 
 SIZE = 48
 
@@ -72,19 +73,16 @@ def test_one_training_frame(tmp_path):
 # The texture's parts
 
 
-def test_a_membrane_without_anything_fixed_takes_its_rest():
+def test_a_membrane_of_which_nothing_is_held_is_zero():
     chain = neighbours(np.array([[0, 1], [1, 2]]), 4)  # and a vertex without neighbours
-    rest = np.array([10.0, 20.0, 30.0])
-    found = membrane(chain, np.zeros((4, 3)), np.zeros(4, bool), rest)
-    np.testing.assert_allclose(found, np.tile(rest, (4, 1)), rtol=0.02)
-    start = membrane(chain, np.zeros((4, 3)), np.zeros(4, bool), rest, np.zeros((4, 3)))
-    assert np.isfinite(start).all()
+    found = screened_membrane(chain, np.full((4, 3), 7.0), np.zeros(4), np.full(4, 1e-6))
+    np.testing.assert_array_equal(found, np.zeros((4, 3)))
 
 
-def test_a_membrane_of_everything_fixed_changes_nothing():
+def test_a_membrane_that_is_held_everywhere_changes_next_to_nothing():
     values = np.arange(6.0).reshape(3, 2)
-    found = membrane(sparse.csr_matrix((3, 3)), values, np.ones(3, bool), np.zeros(2))
-    np.testing.assert_array_equal(found, values)
+    found = screened_membrane(sparse.csr_matrix((3, 3)), values, np.full(3, 1e3), np.full(3, 1e-6))
+    np.testing.assert_allclose(found, values, rtol=1e-6)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-30, 1.0, 1e30])

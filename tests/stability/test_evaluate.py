@@ -5,6 +5,7 @@ import json
 import math
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -18,10 +19,9 @@ from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.splat import Gaussians, render
 from stages.plan import measure
 from stages.plan.run import run as run_plan
-from tests.stages.evaluate_subject import FRAMES, HEIGHT, TEST, WIDTH, make_clip, stand_in
-from tests.stages.test_plan import clip as plan_clip  # noqa: F401 - a fixture
-from tests.stages.test_plan import context_of
-from tests.stages.train_subject import FRAMES as PLANNED
+from tests.made.blob import FRAMES, HEIGHT, TEST, WIDTH, make_clip, stand_in
+from tests.made.portrait import FRAMES as PLANNED
+from tests.stages.test_plan import context_of, write_planned
 
 
 def summary_of(output):
@@ -112,6 +112,9 @@ def test_one_held_out_mask_is_empty(tmp_path):
     output = clip.evaluate()
     assert_published(output)
     assert summary_of(output)["means"]["test"]["avatar"]["psnr_interior"] > 50
+    rows = pq.read_table(output / "metrics.parquet").to_pylist()
+    inside = {row["frame"] for row in rows if row["metric"] == "psnr_interior" and row["split"] == "test"}
+    assert inside == set(TEST[1:])
 
 
 @SOAKED
@@ -150,8 +153,9 @@ def test_a_turntable_of_any_size_has_finite_cameras(scale, offset):
 
 
 @pytest.fixture
-def planned(plan_clip):  # noqa: F811
-    return plan_clip
+def planned(tmp_path):
+    write_planned(tmp_path)
+    return tmp_path
 
 
 def plan_of(clip):

@@ -19,15 +19,10 @@ from stages.fit.outlier_frames import BODY_PAIRS, mask_outlier_frames
 from stages.fit.registration import register
 from stages.fit.settings import FitSettings
 from stages.fit.smoothing import smooth
-from tests.stages.fit_clip import SIZE, load, make_clip, problem_of, whole_body
+from tests.made.detections import SIZE, make_clip, problem_of, whole_body
 
 SHORT = FitSettings(iterations=12)
 LEFT_RIGHT = [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9] + [row + (1 if row % 2 else -1) for row in range(11, 33)]
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
 
 
 @pytest.fixture(scope="module")

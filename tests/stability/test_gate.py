@@ -1,5 +1,7 @@
 """Otsu's threshold and the visibility gate: all shapes of histogram, everything gated, flicker."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -15,13 +17,14 @@ from pipeline.avatar.otsu_threshold import (
     otsu_threshold,
     share_below,
 )
-from pipeline.body import load_body, mean_identity
+from pipeline.body import mean_identity
 from pipeline.errors import UserError
 from pipeline.untrusted import parse_json
 from stages.train import run as stage
 from stages.train.visibility_gate import VisibilityGate
+from tests.made.body import open_body
+from tests.made.portrait import TINY, context_for, trainer_for, with_poses
 from tests.stability.test_skinning import SMALL
-from tests.stages.train_subject import BODY_FILE, TINY, context_for, trainer_for, write_subject
 
 RNG = np.random.default_rng(0)
 SHAPES = {
@@ -89,13 +92,6 @@ def test_scores_that_are_none_are_refused(scores):
 # In training
 
 
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    return folder
-
-
 def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_path):
     """A threshold set by hand that no vertex reaches."""
     settings = {"gate_threshold": 1.0, "gate_from": 0.25, "gate_every": 2, "iterations": 8}
@@ -114,7 +110,7 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
 
 
 def test_an_avatar_without_any_point_is_refused():
-    body = load_body(BODY_FILE)
+    body = open_body()
     with pytest.raises(ValueError, match="kept vertices"):
         Avatar(body, mean_identity(body), torch.zeros(0, dtype=torch.long), SMALL)
     avatar = Avatar(body, mean_identity(body), torch.arange(50), SMALL)
@@ -123,15 +119,10 @@ def test_an_avatar_without_any_point_is_refused():
 
 
 def test_a_body_outside_every_picture_is_refused(subject, tmp_path):
-    from tests.stages.test_train import altered
+    def away(poses):
+        return dataclasses.replace(poses, transl=poses.transl + torch.tensor([50.0, 0, 0]))
 
-    context = altered(
-        subject,
-        tmp_path / "away",
-        lambda poses: poses.__class__(
-            poses.frames, poses.rotation, poses.expression, poses.transl + torch.tensor([50.0, 0, 0])
-        ),
-    )
+    context = context_for(with_poses(subject, tmp_path / "away", away), tmp_path / "out")
     with pytest.raises(UserError, match="outside every frame; run fit again"):
         stage.run(context)
     assert not list(context.output.iterdir())
@@ -170,7 +161,7 @@ def test_flickering_gate_gives_the_same_run_twice(subject, tmp_path):
 
 
 def test_what_was_never_looked_at_has_a_score_of_zero():
-    body = load_body(BODY_FILE)
+    body = open_body()
     avatar = Avatar(body, mean_identity(body), torch.arange(50), SMALL)
     gate = VisibilityGate(avatar, len(body.v_template), TINY)
     assert not gate.scores().any() and gate.scores().isfinite().all()

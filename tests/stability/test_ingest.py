@@ -15,7 +15,7 @@ from stages.ingest.cameras.distortion import distortion_pixels, undistort_frames
 from stages.ingest.mask_smoothing import smooth_masks
 from stages.ingest.masks import fill_holes, follow_edges, fuse, main_component, overlap, selfie_share
 from stages.ingest.run import run
-from tests.stages.ingest_clips import body_points, make_context, walking_blob, write_images
+from tests.made.videos import body_points, ingest_context, walking_blob, write_images
 
 
 def material(folder, frames, masks, points=None):
@@ -31,7 +31,7 @@ def material(folder, frames, masks, points=None):
 
 def ingest(folder, **settings):
     given = {"keypoints": str(folder / "keypoints"), "masks": str(folder / "masks"), **settings}
-    context = make_context(folder / "run", folder / "clip", **given)
+    context = ingest_context(folder / "run", folder / "clip", **given)
     run(context)
     return context.output
 

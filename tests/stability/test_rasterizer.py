@@ -13,7 +13,7 @@ import torch
 from pipeline.clip.camera import Camera
 from pipeline.splat import Gaussians, render
 from pipeline.splat.gsplat_backend import render_gsplat
-from tests.unit.splat_scene import NAMES, draw, images, leaves, scene
+from tests.made.splat_scene import NAMES, draw, images, leaves, scene
 from tests.unit.test_splat_gsplat import rasterization
 
 COUNT = 20

@@ -9,11 +9,11 @@ import roma
 import torch
 from scipy.spatial.transform import Rotation
 
-from pipeline.body import Poses, joint_index, joint_transforms, load_body, mean_identity, pose_body
+from pipeline.body import Poses, joint_index, joint_transforms, mean_identity, pose_body
 from stages.fit.initialise import continuous, shortest_turn
 from stages.fit.parameters import parameters_of
 from stages.fit.smoothing import nearest_branch, smooth
-from tests.stages.train_subject import BODY_FILE
+from tests.made.body import open_body
 
 AXES = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (-0.48, 0.6, 0.64)]
 ANGLES = {
@@ -209,7 +209,7 @@ def test_the_shortest_turn_between_directions_is_a_rotation(end):
 
 def test_a_pose_of_many_turns_is_the_pose_without_them():
     """In float32: a hundred turns cost a tenth of a millimetre, not the pose."""
-    body = load_body(BODY_FILE)
+    body = open_body()
     pose = torch.zeros(2, 55, 3)
     pose[:, joint_index("left_elbow"), 1] = -0.7
     pose[1, joint_index("left_elbow"), 1] += 200 * math.pi

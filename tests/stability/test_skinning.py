@@ -25,15 +25,9 @@ from pipeline.body import (
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.splat import render
-from tests.stages.train_subject import BODY_FILE
-from tests.unit.fake_body import official_arrays, write_official
+from tests.made.fake_body import official_arrays, write_official
 
 ANATOMICAL = 0.6  # radians, standard deviation of a joint: beyond what a person can do
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(BODY_FILE)
 
 
 def identity_of(body, size, seed=0):

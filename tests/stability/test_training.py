@@ -1,7 +1,6 @@
 """Training when things go wrong: spikes, bad frames, rates that are far too high, long runs."""
 
 import os
-import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import torch
 
 from pipeline import device
 from pipeline.avatar import load_avatar
-from pipeline.body import load_body
 from pipeline.clip.frames import frame_path, write_frame, write_mask
 from pipeline.errors import UserError
 from pipeline.finite import NotFiniteError
@@ -17,33 +15,19 @@ from stages.train import run as stage
 from stages.train import schedule
 from stages.train.checkpoint import NAME, read_checkpoint
 from stages.train.held_out import held_out_psnr, require_progress
-from tests.stages.train_subject import (
-    BODY_FILE,
+from tests.made.body import open_body
+from tests.made.portrait import (
     HEIGHT,
     TINY,
     WIDTH,
     change_loss,
     context_for,
+    run_counted,
     trainer_for,
-    write_subject,
+    with_footage,
 )
 
 SIZE = (HEIGHT, WIDTH)
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    return folder
-
-
-def spoilt(subject, folder):
-    """A copy whose footage may be changed."""
-    shutil.copytree(subject / "ingest", folder / "ingest")
-    for name in ("fit", "plan"):
-        (folder / name).symlink_to(subject / name)
-    return folder
 
 
 def checkpoint_of(context):
@@ -72,7 +56,7 @@ def steps(trainer, count):
 
 
 def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_path):
-    place = spoilt(subject, tmp_path / "noise")
+    place = with_footage(subject, tmp_path / "noise")
     noise = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     write_frame(place / "ingest" / "frames", 2, noise)
     settings = {"iterations": 8, "face": 0.0}
@@ -86,16 +70,16 @@ def test_a_frame_of_noise_among_good_ones_is_a_spike_and_no_more(subject, tmp_pa
 
 @pytest.mark.parametrize("value", [0, 255], ids=["nobody", "everything is the person"])
 def test_a_frame_with_an_empty_or_a_full_mask_is_trained_through(subject, tmp_path, value):
-    place = spoilt(subject, tmp_path / "mask")
+    place = with_footage(subject, tmp_path / "mask")
     write_mask(place / "ingest" / "masks", 1, np.full(SIZE, value, np.uint8))
     context = context_for(place, tmp_path / "out", iterations=6, face=0.0)
     stage.run(context)
-    load_avatar(context.output / "avatar.safetensors", load_body(BODY_FILE))
+    load_avatar(context.output / "avatar.safetensors", open_body())
 
 
 @pytest.mark.parametrize("value", [0, 255], ids=["black", "white"])
 def test_black_and_white_frames_are_trained_through(subject, tmp_path, value):
-    place = spoilt(subject, tmp_path / "flat")
+    place = with_footage(subject, tmp_path / "flat")
     for frame in range(5):
         write_frame(place / "ingest" / "frames", frame, np.full((*SIZE, 3), value, np.uint8))
     trainer = trainer_for(context_for(place, tmp_path / "out", face=0.0))
@@ -103,7 +87,7 @@ def test_black_and_white_frames_are_trained_through(subject, tmp_path, value):
 
 
 def test_masks_of_nobody_at_all_are_refused(subject, tmp_path):
-    place = spoilt(subject, tmp_path / "nobody")
+    place = with_footage(subject, tmp_path / "nobody")
     for frame in range(6):
         write_mask(place / "ingest" / "masks", frame, np.zeros(SIZE, np.uint8))
     context = context_for(place, tmp_path / "out")
@@ -113,7 +97,7 @@ def test_masks_of_nobody_at_all_are_refused(subject, tmp_path):
 
 
 def test_a_damaged_frame_among_good_ones_stops_the_run_by_its_name(subject, tmp_path):
-    place = spoilt(subject, tmp_path / "damaged")
+    place = with_footage(subject, tmp_path / "damaged")
     path = frame_path(place / "ingest" / "frames", 3)
     path.write_bytes(path.read_bytes()[:60])
     context = context_for(place, tmp_path / "out", initial_color=False, face=0.0)
@@ -125,7 +109,7 @@ def test_a_damaged_frame_among_good_ones_stops_the_run_by_its_name(subject, tmp_
 def test_one_frame_and_nothing_held_out(subject, tmp_path):
     from pipeline.clip.records import Split, write_split
 
-    place = spoilt(subject, tmp_path / "single")
+    place = with_footage(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=()))
     context = context_for(place, tmp_path / "out")
     stage.run(context)
@@ -175,10 +159,7 @@ def test_a_slope_that_is_not_finite_stops_before_any_weight_moves(subject, tmp_p
     saved = checkpoint_of(context)
     assert saved.iteration == 4 and all_finite(saved.tensors.values())
     monkeypatch.undo()
-    said = []
-    context.log = said.append
-    stage.run(context)
-    assert any("goes on from iteration 4" in line for line in said)
+    assert run_counted(context, monkeypatch) == list(range(4, 8))
 
 
 def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
@@ -191,14 +172,33 @@ def test_every_frame_of_a_step_is_named(subject, tmp_path, monkeypatch):
 # Rates
 
 
-@pytest.mark.parametrize("factor", [100, pytest.param(1e4, marks=pytest.mark.soak)])
-def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(subject, tmp_path, factor):
-    """Finite ruins; before, they were published. Rates that overflow are refused as settings."""
+def far_too_high(factor):
+    """The triplane's rates, all multiplied."""
     names = ("learning_rate", "plane_learning_rate", "pose_learning_rate")
-    rates = {name: factor * getattr(TINY, name) for name in names}
-    settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "warm_up": 1, "face": 0.0}
+    return {"warm_up": 1, **{name: factor * getattr(TINY, name) for name in names}}
+
+
+NAMES = ("color", "offset", "scale", "bases")
+BASES = {"representation": "bases", "bases": 1, "warm_up": 0, "offset_unit": 1.0}
+BASES |= {f"{name}_learning_rate": 0.9 for name in NAMES}
+
+
+@pytest.mark.parametrize(
+    ("rates", "name"),
+    [
+        (far_too_high(100), "learning_rate"),
+        pytest.param(far_too_high(1e4), "learning_rate", marks=pytest.mark.soak),
+        (BASES, "color_learning_rate"),
+    ],
+    ids=["a hundred times", "ten thousand times", "bases"],
+)
+def test_rates_far_too_high_end_with_a_clear_error_and_the_last_good_checkpoint(
+    subject, tmp_path, rates, name
+):
+    """Finite ruins; before, they were published. Rates that overflow are refused as settings."""
+    settings = {"iterations": 30, "held_out_every": 4, "checkpoint_every": 1, "face": 0.0}
     context = context_for(subject, tmp_path / "out", **settings, **rates)
-    with pytest.raises(UserError, match=r"training stopped: .*learning_rate.* checkpoint is kept, nothing"):
+    with pytest.raises(UserError, match=rf"training stopped: .*{name}.* checkpoint is kept, nothing"):
         stage.run(context)
     assert not list(context.output.iterdir())
     saved = checkpoint_of(context)
@@ -236,7 +236,7 @@ def test_bfloat16_follows_float32_over_a_few_steps(subject, tmp_path, monkeypatc
 def test_thousands_of_steps_on_one_frame(subject, tmp_path):
     from pipeline.clip.records import Split, write_split
 
-    place = spoilt(subject, tmp_path / "single")
+    place = with_footage(subject, tmp_path / "single")
     write_split(place / "ingest" / "split.json", Split(train=(2,), test=(5,)))
     count = int(os.environ.get("FLEXIAVATAR_SOAK_STEPS", "4000"))
     trainer = trainer_for(context_for(place, tmp_path / "out", iterations=count))

@@ -11,7 +11,7 @@ import roma
 import torch
 
 from pipeline.avatar import pose_features
-from pipeline.body import PARTS, joint_index, load_body, mean_identity, pose_body, rest_joints
+from pipeline.body import PARTS, joint_index, mean_identity, pose_body, rest_joints
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import read_cameras
 from pipeline.errors import UserError
@@ -20,10 +20,11 @@ from stages.animate.actor import PoseRange, legs_share
 from stages.animate.exr_layers import decode_srgb, exr_layers
 from stages.animate.run import on_background
 from tests.exr_reader import ffmpeg_colors, read_exr
+from tests.made.body import open_body
+from tests.made.doll import awake_avatar, make_studio
+from tests.made.motions import FPS, made_up, write_npz
+from tests.made.portrait import moving_poses
 from tests.ply_reader import read_ply
-from tests.stages.animate_subject import awake_avatar, make_studio
-from tests.stages.train_subject import BODY_FILE, moving_poses
-from tests.unit.motion_files import FPS, made_up, write_npz
 
 COUNT = 5
 GREY = 0xD1 / 255
@@ -38,7 +39,7 @@ def studio(tmp_path_factory):
 def walk(tmp_path_factory):
     rotation, way = made_up(COUNT)
     rotation[:, 0] = 0
-    pivot = rest_joints(load_body(BODY_FILE), mean_identity(load_body(BODY_FILE)))[0].double()
+    pivot = rest_joints(open_body(), mean_identity(open_body()))[0].double()
     return write_npz(tmp_path_factory.mktemp("motion") / "walk.npz", rotation, way, pivot)
 
 
@@ -204,6 +205,13 @@ def test_a_turntable_stands_still_and_goes_round(studio):
     assert json.loads((context.output / "animate.json").read_text())["motion"] == "turntable"
 
 
+def test_a_run_says_which_settings_have_no_effect(studio, capsys):
+    context = studio.animate("idle", up="z", turntable_frames=2)
+    found = json.loads((context.output / "animate.json").read_text())
+    assert len(found["without_effect"]) == 1 and "animate.up=z" in found["without_effect"][0]
+    assert "animate.up=z" in capsys.readouterr().out
+
+
 def test_an_orbit_goes_round_a_moving_body_and_nothing_is_cut_off(studio, walk):
     context = studio.animate("round", motion=str(walk), camera="orbit", outputs=("exr",))
     cameras = read_cameras(context.output / "cameras.parquet")
@@ -254,7 +262,7 @@ def test_the_unseen_body_can_be_shown_in_its_base_colours(half, walk, baking):
     context = half.animate(
         f"base-{baking}", motion=str(walk), outputs=("exr",), unseen="base", last_frame=0, bake=baking
     )
-    assert about(context)["gaussians"] == len(load_body(BODY_FILE).v_template)
+    assert about(context)["gaussians"] == len(open_body().v_template)
     part = read_exr(context.output / "exr" / "000000.exr")["part"]["ID"]
     assert 1 + PARTS.index("left_leg") in part
 
@@ -274,7 +282,7 @@ def test_heads_are_told_of_poses_that_training_showed():
 
 
 def test_how_much_of_the_legs_there_is():
-    body = load_body(BODY_FILE)
+    body = open_body()
     assert legs_share(awake_avatar(), body) == 1 and legs_share(awake_avatar(gated=True), body) < 0.2
 
 
@@ -289,7 +297,7 @@ def test_baked_or_not_the_picture_is_the_same(studio, walk, everything):
 
 def test_the_body_is_where_the_motion_says(everything):
     """The splats lie on the fitted body posed by the motion, within what the heads move them."""
-    body = load_body(BODY_FILE)
+    body = open_body()
     rotation, way = made_up(COUNT)
     rotation[:, 0] = 0
     placed = way.float() - rest_joints(body, mean_identity(body))[0]

@@ -1,5 +1,6 @@
 """The auxiliary stage: guidance, the texture, the crop, folders of others, and when nothing is made."""
 
+import dataclasses
 import json
 import shutil
 
@@ -31,6 +32,8 @@ from pipeline.texture import (
     robust_mean,
     weighted_median,
 )
+from pipeline.texture.completion import shading
+from pipeline.texture.membrane import neighbours, screened_membrane
 from stages.auxiliary import run as stage
 from stages.auxiliary.crop import find_framing
 from stages.auxiliary.folder import read_folder
@@ -38,10 +41,11 @@ from stages.auxiliary.publish import NOTHING_NEW
 from stages.auxiliary.reference import score_frames
 from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import OCCLUDED, body_18, draw_skeleton, turntable_keypoints
-from stages.auxiliary.texture_generator import complete, membrane, neighbours, shading
+from stages.auxiliary.texture_generator import complete
 from stages.auxiliary.turntable_motion import ID_OFFSET, make_turntable_motion
-from tests.plans import plan_of
-from tests.stages.auxiliary_subject import BODY_FILE, body_and_landmarks, context_for, read, write_clip
+from tests.made.body import BODY_FILE, open_body, open_landmarks
+from tests.made.mannequin_clip import context_for, read, write_clip
+from tests.made.plans import plan_of
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +93,7 @@ def test_the_turn_goes_once_round_and_stays_in_the_picture(full, motion):
 
 
 def test_a_turned_away_face_has_no_points_and_a_hidden_limb_a_lower_score(full):
-    clip, landmarks = read(full), body_and_landmarks()[1]
+    clip, landmarks = read(full), open_landmarks()
     points = turntable_keypoints(clip, make_turntable_motion(clip, small()), landmarks)
     assert points[0, FACE, 2].mean() > 0.9 and points[4, FACE, 2].mean() < 0.1
     assert points[0, 0, 2] == 1 and points[4, 0, 2] == 0
@@ -139,27 +143,28 @@ def test_a_frame_that_slipped_is_outvoted():
     assert robust_mean(colors, np.ones((5, 1), np.float32)) == pytest.approx(100)
 
 
-def test_the_membrane_is_straight_between_its_ends():
+def test_a_membrane_without_a_screen_is_straight_between_its_ends():
     count = 11
     chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
-    values, fixed = np.zeros((count, 1)), np.zeros(count, bool)
-    values[-1], fixed[[0, -1]] = 10, True
-    found = membrane(neighbours(chain, count), values, fixed, np.zeros(1))
-    assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-3)
-    again = membrane(neighbours(chain, count), values, fixed, np.zeros(1), start=found)
-    assert again == pytest.approx(found, abs=0.05)
+    values, hold = np.zeros((count, 1)), np.zeros(count)
+    values[-1], hold[[0, -1]] = 10, 1e6
+    found = screened_membrane(neighbours(chain, count), values, hold, np.full(count, 1e-9))
+    assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-2)
 
 
-def test_a_part_without_a_known_neighbour_takes_the_mean():
-    pairs = np.array([[0, 1], [2, 3]])
-    fixed = np.array([True, False, False, False])
-    found = membrane(neighbours(pairs, 4), np.full((4, 1), 7.0), fixed, np.array([3.0]))
-    assert found[:, 0] == pytest.approx([7, 7, 3, 3], abs=1e-3)
+def test_a_screen_lets_a_membrane_fade_away_from_what_is_held():
+    count = 41
+    chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
+    hold = np.where(np.arange(count) == 0, 1e6, 0.0)
+    sink = np.full(count, 0.04)  # a reach of five edges
+    found = screened_membrane(neighbours(chain, count), np.full((count, 1), 3.0), hold, sink)[:, 0]
+    assert found[0] == pytest.approx(3, abs=1e-2) and found[-1] < 0.02 and (np.diff(found) < 1e-6).all()
+    assert found[5] == pytest.approx(3 / np.e, rel=0.05)
 
 
 def test_the_unseen_side_is_the_mirror_of_the_seen_one():
     """Known on the left only, with a pattern: the right gets the pattern, not a blur."""
-    body = body_and_landmarks()[0]
+    body = open_body()
     surface = fine_surface(body, 0)
     points = body.v_template.numpy()
     pattern = 128 + 100 * np.sin(30 * points[:, 1:2]) * np.ones((1, 3))
@@ -174,18 +179,18 @@ def test_the_unseen_side_is_the_mirror_of_the_seen_one():
 
 def test_an_unseen_back_is_shaded_as_the_light_says():
     """White seen from the front under a lamp in front: the slope is found, and the back is not as bright."""
-    surface = fine_surface(body_and_landmarks()[0], 0)
-    normal = vertex_normals(body_and_landmarks()[0].v_template, surface.faces).numpy()
+    surface = fine_surface(open_body(), 0)
+    normal = vertex_normals(open_body().v_template, surface.faces).numpy()
     known = normal[:, 2] > 0.1
     color = (150 * np.exp(0.4 * normal[:, 2:3]) * np.ones((1, 3))).astype(np.float32)
     weight = known.astype(np.float32)
-    shade = shading(color, weight, normal, surface.part)
+    shade = shading(color / 255, weight, normal, surface.segments.part)
     assert shade[known].max() - shade[known].min() == pytest.approx(0.34, abs=0.04)
     back = normal[:, 2] < -0.5
     assert shade[back] == pytest.approx(shade[known].min(), abs=0.02)
     seen = VertexColors(np.where(known[:, None], color, 0), weight, known, normal.astype(np.float32))
     assert np.median(complete(surface, seen)[back]) < 165
-    assert not shading(color, np.zeros(len(color)), normal, surface.part).any()
+    assert not shading(color, np.zeros(len(color)), normal, surface.segments.part).any()
 
 
 def test_projected_colours_are_those_of_the_frames(full):
@@ -264,7 +269,7 @@ def test_the_same_bytes_again(full, painted, tmp_path):
 
 def test_off_costs_nothing(full, tmp_path):
     context = context_for(full, tmp_path / "off", generator="off")
-    context.inputs = {}
+    context = dataclasses.replace(context, inputs={})
     stage.run(context)
     assert not list(context.output.iterdir())
 
@@ -276,7 +281,7 @@ def test_auto_goes_by_the_plan(full, tmp_path):
     assert stage.chosen_generator(quick) == "off" and "auxiliary.generator=auto" in quick.logged[-1]
     shutil.copytree(full / "plan", tmp_path / "plan")
     write_plan(tmp_path / "plan" / "plan.json", plan_of(auxiliary_views=False))
-    context.inputs["plan"] = tmp_path / "plan"
+    context = dataclasses.replace(context, inputs={**context.inputs, "plan": tmp_path / "plan"})
     assert stage.chosen_generator(context) == "off"
 
 

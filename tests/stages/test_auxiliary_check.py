@@ -16,7 +16,8 @@ from stages.auxiliary.detect_generated import DetectedPicture
 from stages.auxiliary.register import MIRRORED, register
 from stages.auxiliary.skeleton import turntable_keypoints
 from stages.auxiliary.turntable_motion import make_turntable_motion
-from tests.stages.auxiliary_subject import body_and_landmarks, context_for, films, read, write_clip
+from tests.made.body import open_landmarks
+from tests.made.mannequin_clip import context_for, films, read, write_clip
 
 FRAMES, SIZE = 8, (360, 640)
 NEEDED = ("mediapipe", "dlib", "identity")
@@ -137,7 +138,7 @@ def test_one_bad_face_is_one_frame_and_most_of_them_are_everybody():
 
 
 def test_exchanged_sides_are_noticed(clip, turn):
-    points = turntable_keypoints(read(clip), turn, body_and_landmarks()[1])[4]
+    points = turntable_keypoints(read(clip), turn, open_landmarks())[4]
     exchanged = points.copy()
     exchanged[:23] = points[MIRRORED]
     straight, mirrored = (
@@ -151,7 +152,7 @@ def test_exchanged_sides_are_noticed(clip, turn):
 
 def test_a_body_that_moved_is_found_again(clip, turn):
     """Keypoints of a pose 6 cm to the side with an arm lowered: the registration goes there."""
-    person, landmarks = read(clip), body_and_landmarks()[1]
+    person, landmarks = read(clip), open_landmarks()
     rotation, transl = turn.poses.rotation.clone(), turn.poses.transl.clone()
     rotation[:, 16, 2] -= 0.3
     transl[:, 0] += 0.06

@@ -127,7 +127,7 @@ def test_blending_is_the_weighted_mean_of_the_tiles(model, monkeypatch):
         return torch.full_like(noisy, float(len(calls)))
 
     seen = []
-    monkeypatch.setattr("stages.auxiliary.mimicmotion.denoising._guided", guided)
+    monkeypatch.setattr("stages.auxiliary.mimicmotion.denoising.guided_noise", guided)
     step = type(model.scheduler).step
     monkeypatch.setattr(
         type(model.scheduler), "step", lambda self, mean, *rest: seen.append(mean) or step(self, mean, *rest)

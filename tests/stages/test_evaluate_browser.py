@@ -8,7 +8,7 @@ import pytest
 from pipeline.clip.frames import write_png
 from stages.evaluate.scores import TableRow
 from stages.evaluate.second_mask import SecondMask, edge
-from tests.stages.evaluate_subject import TEST, make_clip
+from tests.made.blob import TEST, make_clip
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 QUIET = (

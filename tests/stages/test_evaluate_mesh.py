@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body import load_body, write_identity, write_poses
+from pipeline.body import write_identity, write_poses
 from pipeline.clip.camera import Camera
 from pipeline.clip.frames import write_frame, write_mask
-from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import write_cameras
 from pipeline.metrics import interior, psnr
 from pipeline.splat import render
@@ -18,7 +17,8 @@ from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.methods import AVATAR, AvatarMethod
 from stages.evaluate.other_cameras import read_true_surface, score_other_cameras
 from stages.evaluate.textured_mesh import textured_mesh
-from tests.stages.train_subject import BODY_FILE, moving_poses, painted_avatar, write_subject
+from tests.made.body import open_body
+from tests.made.portrait import moving_poses, painted_avatar, write_trained
 
 
 def behind(camera):
@@ -30,18 +30,13 @@ def behind(camera):
 
 
 @pytest.fixture(scope="module")
-def subject(tmp_path_factory):
+def painted(tmp_path_factory):
     """The body of the train stage's tests, with the truth of its surface and a camera behind it."""
     folder = tmp_path_factory.mktemp("body")
-    write_subject(folder)
-    ingest, avatar, poses = folder / "ingest", painted_avatar(), moving_poses()
-    (folder / "train").mkdir()
-    write_poses(folder / "train" / "poses.parquet", poses)
-    write_keypoints(ingest / "keypoints.parquet", empty_keypoints(np.arange(len(poses.frames))))
-    write_poses(ingest / "truth_poses.parquet", poses)
-    write_identity(ingest / "truth_surface.safetensors", avatar.identity, load_body(BODY_FILE))
-    inputs = {name: folder / name for name in ("ingest", "fit", "plan", "train")}
-    clip = read_evaluated_clip(inputs, load_body(BODY_FILE))
+    inputs, avatar, ingest = write_trained(folder), painted_avatar(), folder / "ingest"
+    write_poses(ingest / "truth_poses.parquet", moving_poses())
+    write_identity(ingest / "truth_surface.safetensors", avatar.identity, open_body())
+    clip = read_evaluated_clip(inputs, open_body())
     view = ingest / "views" / "back"
     for name in ("frames", "masks"):
         (view / name).mkdir(parents=True)
@@ -54,8 +49,8 @@ def subject(tmp_path_factory):
     return clip, avatar
 
 
-def test_the_textured_mesh_comes_nearer_than_a_still(subject):
-    clip, advanced = subject[0], []
+def test_the_textured_mesh_comes_nearer_than_a_still(painted):
+    clip, advanced = painted[0], []
     mesh = textured_mesh(clip, clip.split.train[::2], lambda: advanced.append(1))
     assert len(advanced) == 3 and 0.02 < mesh.known < 0.5
     held_out = clip.split.test[0]
@@ -65,8 +60,8 @@ def test_the_textured_mesh_comes_nearer_than_a_still(subject):
     assert psnr(drawn, truth, inside) > psnr(still, truth, inside) + 3
 
 
-def test_what_no_training_frame_shows_is_told_apart(subject):
-    clip, avatar = subject
+def test_what_no_training_frame_shows_is_told_apart(painted):
+    clip, avatar = painted
     true = read_true_surface(clip)
     assert 0.05 < true.seen.mean() < 0.6
     # From the front nearly everything is seen, from behind hardly anything.
@@ -89,7 +84,7 @@ def test_what_no_training_frame_shows_is_told_apart(subject):
     assert wrong["psnr_unseen"] < 20 and wrong["psnr"] < right["psnr"] - 10
 
 
-def test_a_clip_without_truth_has_none(tmp_path, subject):
-    bare = dataclasses.replace(subject[0], folder=tmp_path)
+def test_a_clip_without_truth_has_none(tmp_path, painted):
+    bare = dataclasses.replace(painted[0], folder=tmp_path)
     assert read_true_surface(bare) is None
     assert list(score_other_cameras(bare, [], None, "black")) == []

@@ -21,7 +21,7 @@ from stages.evaluate.second_mask import SecondMask, edge, estimated, second_mask
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.statistics import bounds, differences, intervals
 from stages.evaluate.textured_mesh import nearest_known
-from tests.stages.evaluate_subject import HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
+from tests.made.blob import HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
 
 
 @pytest.fixture
@@ -51,9 +51,9 @@ def test_the_truth_under_another_mask_is_the_ceiling_and_no_contestant(clip):
     rows = pq.read_table(output / "metrics.parquet").to_pylist()
     assert {row["frame"] for row in rows if row["method"] == "second_mask"} == set(TEST[:2])
     assert f"<b>{ceiling['psnr']:.2f}</b>" not in report
-    assert "the second one is the same, 1 px smaller (2 frames)" in report
+    assert "the same, 1 px smaller (2 frames)" in report
     assert summary["frames_with_second_mask"] == 2
-    assert "masks (the truth itself scores" in " ".join(summary["verdict"])
+    assert f"{ceiling['psnr']:.1f} dB" in " ".join(summary["verdict"])
 
 
 def test_the_edge_is_one_pixel_further_in_and_open_at_the_border():
@@ -125,21 +125,15 @@ def noisy(pose, time):
 def test_the_truths_mask_on_both_pictures_forgives_and_says_so(clip):
     own = clip.evaluate(noisy, name="own")
     both = clip.evaluate(noisy, name="both", render_mask="truth")
-    paper = clip.evaluate(noisy, name="paper", protocol="paper_black")
     strict, kind = (summary_of(one)["means"]["test"]["avatar"] for one in (own, both))
     assert kind["psnr"] > strict["psnr"] + 1
     # What the protocol chose is among the composites that are always shown.
     for one in (strict, kind):
         assert one["psnr_black_own"] == strict["psnr"] and one["psnr_black_truth"] == kind["psnr"]
-    assert summary_of(paper)["means"] == summary_of(both)["means"]
-    assert summary_of(paper)["choices"]["protocol"] == "paper_black"
-    assert "Protocol paper_black. " in summary_of(paper)["protocol"]
-    assert "Protocol ours, some of its choices changed. " in summary_of(both)["protocol"]
-    report = (both / "report.html").read_text()
-    assert (
-        "No more is left of any picture than the truth&#39;s mask holds" in report
-        and "its own alpha" in report
-    )
+    named = EvaluateSettings(protocol="paper_black").choices
+    changed = EvaluateSettings(render_mask="truth", refine_test_poses="off").choices
+    assert named == changed and named != EvaluateSettings().choices
+    assert summary_of(own)["protocol"] != summary_of(both)["protocol"]
 
 
 # Faces
@@ -191,7 +185,8 @@ def test_held_out_frames_of_another_camera_stand_apart(clip):
         > 50
         > apart["other camera"]["test"]["avatar"]["psnr"]
     )
-    assert "Cameras that training never had" in (output / "report.html").read_text()
+    shown = f"{apart['other camera']['test']['avatar']['psnr']:.2f}"
+    assert shown in (output / "report.html").read_text()
 
 
 def test_a_mannequins_cameras_are_shown_by_name(clip):
@@ -203,7 +198,7 @@ def test_a_mannequins_cameras_are_shown_by_name(clip):
     shown = camera_table(summary_of(output))
     assert [row.label for row in shown.rows] == ["back: avatar"]
     assert [cell.text for cell in shown.rows[0].cells] == ["20.00", "25.00", "12.00"]
-    assert "PSNR never-seen surface" in (output / "report.html").read_text()
+    assert "12.00" in (output / "report.html").read_text()
     rows = pq.read_table(output / "metrics.parquet").to_pylist()
     assert {row["view"] for row in rows} == {"", "back"}
 

@@ -16,7 +16,7 @@ from stages.evaluate.report.pictures import compare, comparison_sheet
 from stages.evaluate.report.videos import turntable_pictures
 from stages.evaluate.scores import TableRow, score_table
 from stages.evaluate.statistics import means
-from tests.stages.evaluate_subject import stand_in
+from tests.made.blob import stand_in
 
 
 def flat(value):

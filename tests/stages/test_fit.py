@@ -1,9 +1,7 @@
 """Registration on clips whose truth is known, and the stage's files."""
 
-import contextlib
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -21,14 +19,10 @@ from stages.fit.adam import optimise
 from stages.fit.registration import register
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
-from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER, QUICK, SIZE, load, make_clip, problem_of, whole_body
+from tests.made.context import stage_context
+from tests.made.detections import QUICK, SIZE, make_clip, problem_of, whole_body
 
 LEFT_ARM = ("left_shoulder", "left_elbow", "left_wrist")
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
 
 
 @pytest.fixture(scope="module")
@@ -198,23 +192,11 @@ def ingest(tmp_path, model):
     return folder
 
 
-def context_for(ingest, output):
-    output.mkdir()
-
-    @contextlib.contextmanager
-    def progress(total, label):
-        yield SimpleNamespace(advance=lambda n=1, note="": None)
-
-    said = []
-    return SimpleNamespace(
-        subject="toy", settings=FitSettings(iterations=5), inputs={"ingest": ingest}, assets={}, source=None,
-        body=BODY_FOLDER, body_file=BODY_FILE, output=output, work=output.parent, progress=progress,
-        log=said.append, timing=lambda name, value: None, said=said,
-    )  # fmt: skip
-
-
 def test_stage_publishes_its_files_twice_alike(tmp_path, model, ingest):
-    contexts = [context_for(ingest, tmp_path / name) for name in ("a", "b")]
+    contexts = [
+        stage_context("fit", FitSettings(iterations=5), tmp_path / name, {"ingest": ingest})
+        for name in ("a", "b")
+    ]
     for context in contexts:
         run(context)
     files = sorted(path.name for path in contexts[0].output.iterdir())
@@ -238,4 +220,4 @@ def test_stage_publishes_its_files_twice_alike(tmp_path, model, ingest):
     rows = list(zip(table["frame"], table["point"], strict=True))
     assert len(set(rows)) == len(rows) > 40  # a row a keypoint
     assert all(0 <= pixels < 100 for pixels in table["pixels"])
-    assert "body" in contexts[0].said[-1]
+    assert "body" in contexts[0].logged[-1]

@@ -16,8 +16,7 @@ from stages.fit.face.from_mesh import densest_half, face_from_mesh
 from stages.fit.face.target import FaceModel, aligned, face_model, make_target, sface
 from stages.fit.observations import observe
 from stages.fit.settings import FitSettings
-from tests.stages.face_clip import make_faces
-from tests.stages.fit_clip import load
+from tests.made.faces import make_faces
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -28,13 +27,8 @@ def one_thread():
 
 
 @pytest.fixture(scope="module")
-def body():
-    return load()
-
-
-@pytest.fixture(scope="module")
-def face(body):
-    return face_model(body[0], body[1].face_mesh)
+def face(model):
+    return face_model(model[0], model[1].face_mesh)
 
 
 @pytest.fixture(scope="module")
@@ -224,19 +218,19 @@ def keypoints_of(clip, rows):
     return keypoints
 
 
-def fitted(body, keypoints, views, settings):
+def fitted(model, keypoints, views, settings):
     said = []
-    observed = observe(keypoints, body[1], 0.4, views.size.numpy(), settings.masked)
-    return fit_face(*body, keypoints, observed, views, settings, said.append), said
+    observed = observe(keypoints, model[1], 0.4, views.size.numpy(), settings.masked)
+    return fit_face(*model, keypoints, observed, views, settings, said.append), said
 
 
-def test_fit_face_gives_the_same_twice_on_any_number_of_threads(body, face, clip, target):
+def test_fit_face_gives_the_same_twice_on_any_number_of_threads(model, face, clip, target):
     keypoints = keypoints_of(clip, face.rows.numpy())
     before, results = torch.get_num_threads(), []
     for count in (1, 2):
         torch.set_num_threads(count)
         try:
-            results.append(fitted(body, keypoints, clip.views, FitSettings())[0])
+            results.append(fitted(model, keypoints, clip.views, FitSettings())[0])
         finally:
             torch.set_num_threads(before)
     for name in ("neutral", "expression", "jaw", "orientation", "valid", "rows", "edges"):
@@ -244,14 +238,14 @@ def test_fit_face_gives_the_same_twice_on_any_number_of_threads(body, face, clip
     assert rms(results[0].neutral - target.neutral) < 0.0005
 
 
-def test_fit_face_says_what_it_did(body, face, clip):
+def test_fit_face_says_what_it_did(model, face, clip):
     keypoints = keypoints_of(clip, face.rows.numpy())
-    found, said = fitted(body, keypoints, clip.views, FitSettings(face="mesh"))
+    found, said = fitted(model, keypoints, clip.views, FitSettings(face="mesh"))
     assert found.source == "mesh" and len(said) == 1 and "(mesh): fitted in" in said[0]
-    found, said = fitted(body, keypoints, clip.views, FitSettings(face="off"))
+    found, said = fitted(model, keypoints, clip.views, FitSettings(face="off"))
     assert found is None and said == ["face first: switched off"]
     keypoints.face_mesh[..., 3] = 0.1
-    found, said = fitted(body, keypoints, clip.views, FitSettings())
+    found, said = fitted(model, keypoints, clip.views, FitSettings())
     assert found is None and "no frame shows" in said[0]
-    found, said = fitted(body, empty_keypoints(np.arange(40)), clip.views, FitSettings())
+    found, said = fitted(model, empty_keypoints(np.arange(40)), clip.views, FitSettings())
     assert found is None and "no face mesh" in said[0]

@@ -14,39 +14,34 @@ from stages.fit.camera_batch import stack
 from stages.fit.face_direction import TURNED, mesh_facing, points_facing, pose_facing
 from stages.fit.hand_trust import trusted_flat_hands
 from stages.fit.observations import detected, observe
-from tests.stages.fit_clip import load, make_clip, whole_body
+from tests.made.detections import make_clip, whole_body
 
 ANGLES = (0.0, 0.5, -0.8, 1.4, 2.4, 3.14)  # radians to either side
 
 
 @pytest.fixture(scope="module")
-def body():
-    return load()
-
-
-@pytest.fixture(scope="module")
-def turned(body):
+def turned(model):
     """The mean body turned about the vertical, its points seen as if it were of glass."""
     count = len(ANGLES)
     rotation = torch.zeros(count, 55, 3)
     rotation[:, 0, 1] = torch.tensor(ANGLES)
     transl = torch.tensor([0.0, -0.3, -2.0]).expand(count, 3)
-    vertices, joints = pose_body(body[0], mean_identity(body[0]), rotation, torch.zeros(count, 1), transl)
+    vertices, joints = pose_body(model[0], mean_identity(model[0]), rotation, torch.zeros(count, 1), transl)
     camera = facing_camera(256, 256, 300.0)
 
     def seen(points):
         places = locate(points, joints, vertices)
         return torch.cat([project(camera, places), -300 / 2 * places[..., 2:]], -1).numpy()
 
-    whole = seen(body[1].whole_body)
+    whole = seen(model[1].whole_body)
     whole[..., 2] = 1.0
-    return rotation, stack([camera] * count), seen(body[1].face_mesh), whole
+    return rotation, stack([camera] * count), seen(model[1].face_mesh), whole
 
 
-def test_the_cosine_is_found_from_mesh_points_and_pose(body, turned):
+def test_the_cosine_is_found_from_mesh_points_and_pose(model, turned):
     rotation, views, mesh, whole = turned
     cosine = np.cos(ANGLES)
-    assert pose_facing(rotation, body[0].parents, views) == pytest.approx(cosine, abs=1e-5)
+    assert pose_facing(rotation, model[0].parents, views) == pytest.approx(cosine, abs=1e-5)
     assert mesh_facing(mesh) == pytest.approx(cosine, abs=0.15)
     flat = points_facing(whole[:, FACE], whole[:, 3:5], 0.4)
     assert flat == pytest.approx(cosine, abs=0.25)
@@ -76,23 +71,23 @@ def test_what_was_not_found_faces_nowhere():
     assert (points_facing(np.full((2, 68, 3), np.nan), np.zeros((2, 2, 3)), 0.4) == 0).all()
 
 
-def test_points_of_a_turned_face_are_masked(body, turned):
+def test_points_of_a_turned_face_are_masked(model, turned):
     _, views, mesh, whole = turned
     keypoints = empty_keypoints(np.arange(len(ANGLES)))
     keypoints.whole_body[:] = whole
     sizes = views.size.numpy()
     expected = [True, True, True, False, False, False]
-    observed = observe(keypoints, body[1], 0.4, sizes)
+    observed = observe(keypoints, model[1], 0.4, sizes)
     assert observed.mask[:, observed.of("face")].any(1).tolist() == expected
     assert observed.mask[:, :5].any(1).tolist() == [not seen for seen in expected]
     pose = np.array([-0.9, 1, 1, 1, 1, 1])  # the initial pose knows better in the first frame
-    observed = observe(keypoints, body[1], 0.4, sizes, facing=pose)
+    observed = observe(keypoints, model[1], 0.4, sizes, facing=pose)
     assert observed.mask[:, observed.of("face")].any(1).tolist() == [False, True, True, False, False, False]
     keypoints.pose_image[..., :2], keypoints.pose_image[..., 3] = 100.0, 1.0
     keypoints.face_mesh[..., :3], keypoints.face_mesh[..., 3] = mesh, 1.0
-    observed = observe(keypoints, body[1], 0.4, sizes)
+    observed = observe(keypoints, model[1], 0.4, sizes)
     assert observed.mask[:, observed.of("face")].any(1).tolist() == expected
-    observed = observe(keypoints, body[1], 0.4, sizes, masked=False)
+    observed = observe(keypoints, model[1], 0.4, sizes, masked=False)
     assert observed.mask[:, observed.of("face")].all()
 
 
@@ -133,8 +128,8 @@ def test_of_two_hands_at_one_place_the_worse_goes():
 # Without the mask
 
 
-def test_without_the_mask_everything_that_was_found_counts(body):
-    clip = make_clip(*body, count=2)
+def test_without_the_mask_everything_that_was_found_counts(model):
+    clip = make_clip(*model, count=2)
     pose, hands = clip.keypoints.pose_image.copy(), clip.keypoints.hands.copy()
     pose[:, 13, 3] = 0.1  # an elbow under tau
     pose[:, 14, :2] = -40.0  # one outside the picture
@@ -143,8 +138,8 @@ def test_without_the_mask_everything_that_was_found_counts(body):
     hands[0, 0, :, :2] = 50.0  # no score, yet a place
     keypoints = dataclasses.replace(clip.keypoints, pose_image=pose, hands=hands)
     sizes = np.full((2, 2), 256.0)
-    masked = observe(keypoints, body[1], 0.4, sizes)
-    trusting = observe(keypoints, body[1], 0.4, sizes, masked=False)
+    masked = observe(keypoints, model[1], 0.4, sizes)
+    trusting = observe(keypoints, model[1], 0.4, sizes, masked=False)
     assert not masked.mask[:, [13, 14, 15, 23, 24, 25]].any()
     assert trusting.mask[:, [13, 14, 23, 24, 25]].all() and not trusting.mask[:, 15].any()
     left = trusting.mask[:, trusting.of("left_hand")]
@@ -153,15 +148,15 @@ def test_without_the_mask_everything_that_was_found_counts(body):
     assert torch.isfinite(trusting.pixels).all()
 
 
-def test_without_the_mask_the_133_points_count_too(body):
-    clip = whole_body(make_clip(*body, count=2), *body)
+def test_without_the_mask_the_133_points_count_too(model):
+    clip = whole_body(make_clip(*model, count=2), *model)
     points = clip.keypoints.whole_body.copy()
     points[0, LEFT_HAND, 2] = 0.05
     points[1, FACE] = 0.0
     keypoints = dataclasses.replace(clip.keypoints, whole_body=points)
     sizes = np.full((2, 2), 256.0)
-    assert not observe(keypoints, body[1], 0.4, sizes).mask[0, LEFT_HAND].any()
-    trusting = observe(keypoints, body[1], 0.4, sizes, masked=False)
+    assert not observe(keypoints, model[1], 0.4, sizes).mask[0, LEFT_HAND].any()
+    trusting = observe(keypoints, model[1], 0.4, sizes, masked=False)
     assert trusting.mask[0].all() and not trusting.mask[1, FACE].any()
 
 

@@ -20,16 +20,16 @@ from pipeline.pose_files import (
     write_initial_poses,
     write_peer_files,
 )
-from pipeline.run.stage import Context
 from stages.fit.initialise_from_poses import given_identity
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest
-from tests.stages import layout_writers as writers
-from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER
-from tests.stages.ingest_clips import make_context
-from tests.stages.layout_footage import COUNT, SIZE, footage
-from tests.unit.fake_body import write_official
+from tests.made import layouts as writers
+from tests.made.body import BODY_FILE
+from tests.made.context import stage_context
+from tests.made.fake_body import write_official
+from tests.made.layout_footage import COUNT, SIZE, footage
+from tests.made.videos import ingest_context
 
 
 @pytest.fixture(scope="module")
@@ -42,21 +42,15 @@ def ingested(shown, tmp_path_factory):
     folder = tmp_path_factory.mktemp("prepared")
     every = list(range(COUNT))
     source = writers.prepared(folder / "me", shown, {"all": every, "train": every[:4], "test": every[4:]})
-    context = make_context(folder / "run", source)
+    context = ingest_context(folder / "run", source)
     run_ingest(context)
     return context.output
 
 
 def fit(folder, ingested, **settings):
-    output, work = folder / "output", folder / "work"
-    output.mkdir(parents=True)
-    work.mkdir()
-    context = Context(
-        subject="me", settings=FitSettings(**settings), inputs={"ingest": ingested}, assets={}, source=None,
-        body=BODY_FOLDER, body_file=BODY_FILE, output=output, work=work, stage="fit",
-    )  # fmt: skip
+    context = stage_context("fit", FitSettings(**settings), folder / "output", {"ingest": ingested})
     run(context)
-    return output
+    return context.output
 
 
 def surface_error(shown, output):
@@ -131,7 +125,7 @@ def test_our_own_fit_goes_out_and_comes_back(tmp_path, shown):
     writers.pictures(folder / "frames", still.images, [f"{row}.png" for row in every])
     writers.pictures(folder / "masks", still.masks, [f"{row}.png" for row in every])
     writers.keypoint_files(folder / "keypoints_whole_body", still.keypoints, every)
-    context = make_context(tmp_path / "run", folder)
+    context = ingest_context(tmp_path / "run", folder)
     run_ingest(context)
     assert surface_error(shown, fit(tmp_path / "fit", context.output, given="keep")) < 1e-4
 

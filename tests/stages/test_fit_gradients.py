@@ -6,11 +6,11 @@ import pytest
 import roma
 import torch
 
-from pipeline.body import forward_kinematics, load_body
+from pipeline.body import forward_kinematics
 from stages.fit import terms
 from stages.fit.joint_limits import joint_limits
 from stages.fit.parameters import parameters_of
-from tests.stages.fit_clip import BODY_FILE
+from tests.made.body import open_body
 
 T, N = 3, 4
 
@@ -56,7 +56,7 @@ def test_gradient(name):
 
 def test_gradient_of_six_numbers_a_rotation():
     """6D -> matrix -> the skinning transforms of a chain of joints."""
-    body = load_body(BODY_FILE)
+    body = open_body()
     joints = (body.joint_regressor @ body.v_template).double()
     six = roma.rotvec_to_rotmat(random(1, 55, 3, scale=0.3))[..., :2].requires_grad_()
     # The sum over joints keeps gradcheck's numerical Jacobian small.

@@ -3,19 +3,13 @@
 import math
 
 import numpy as np
-import pytest
 
 from stages.fit.hand_trust import trusted_hands
 from stages.fit.observations import observe
 from stages.fit.registration import views_of
 from stages.ingest.mannequin.footage import make_mannequin
 from stages.ingest.mannequin.spec import MannequinSpec
-from tests.stages.fit_clip import load, make_clip
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
+from tests.made.detections import make_clip
 
 
 def hand_track(count=9):

@@ -34,7 +34,8 @@ from stages.fit.initialise_from_poses import initial_from_files
 from stages.fit.observations import observe
 from stages.fit.parameters import landmark_model
 from stages.fit.registration import views_of
-from tests.stages.fit_clip import BODY_FILE, load, make_clip
+from tests.made.body import BODY_FILE
+from tests.made.detections import make_clip
 
 FRAMES = (3, 4, 7, 9)
 COUNT = len(FRAMES)
@@ -42,16 +43,6 @@ COUNT = len(FRAMES)
 
 def draw(*shape, seed=0, scale=1.0):
     return (scale * torch.from_numpy(np.random.default_rng(seed).normal(size=shape))).float()
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
-
-
-@pytest.fixture(scope="module")
-def body(model):
-    return model[0]
 
 
 @pytest.fixture(scope="module")

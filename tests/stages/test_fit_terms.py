@@ -8,7 +8,7 @@ import pytest
 import roma
 import torch
 
-from pipeline.body import Identity, joint_index, joint_transforms, load_body, locate, pose_body
+from pipeline.body import Identity, joint_index, joint_transforms, locate, pose_body
 from pipeline.finite import NotFiniteError
 from stages.fit import terms
 from stages.fit.adam import finite_sum, rate
@@ -19,12 +19,8 @@ from stages.fit.observations import drop_guesses, observe, visible
 from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.registration import views_of
 from stages.fit.windows import bumps
-from tests.stages.fit_clip import BODY_FILE, load, make_clip
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
+from tests.made.body import open_body
+from tests.made.detections import make_clip
 
 
 def test_keypoint_loss():
@@ -93,7 +89,7 @@ def test_acceleration_and_velocity():
 
 
 def test_rotation_vectors_have_finite_gradients_at_zero():
-    body = load_body(BODY_FILE)
+    body = open_body()
     joints = body.joint_regressor @ body.v_template
     rotation = torch.zeros(2, 55, 3, requires_grad=True)
     transforms = joint_transforms(rotation, joints, body.parents)

@@ -13,12 +13,7 @@ from stages.fit.parameters import landmark_model, movable_joints, parameters_of
 from stages.fit.registration import register, views_of
 from stages.fit.settings import FitSettings
 from stages.fit.windows import windows
-from tests.stages.fit_clip import QUICK, load, make_clip
-
-
-@pytest.fixture(scope="module")
-def model():
-    return load()
+from tests.made.detections import QUICK, make_clip
 
 
 def prepared(model, count, gap=1):

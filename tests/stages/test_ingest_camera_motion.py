@@ -21,7 +21,7 @@ from stages.ingest.cameras.rotation_only import (
 from stages.ingest.cameras.scale import metric_scale, person_positions
 from stages.ingest.detect import DetectedClip
 from stages.ingest.video import Clip
-from tests.stages.camera_scene import (
+from tests.made.room import (
     FOCAL,
     HEIGHT,
     MATRIX,
@@ -32,7 +32,7 @@ from tests.stages.camera_scene import (
     person_keypoints,
     rotation_error,
 )
-from tests.stages.ingest_clips import make_context
+from tests.made.videos import ingest_context
 
 CENTRE = (WIDTH / 2, HEIGHT / 2)
 
@@ -72,7 +72,7 @@ def test_a_camera_that_only_turns_is_followed(tmp_path: Path) -> None:
 
 def sfm_scene(folder: Path, **settings: object):
     """The context of a filmed orbit, its clip, what is seen of the person, and the truth."""
-    context = make_context(folder, None, **settings)
+    context = ingest_context(folder, None, **settings)
     truth = filmed(context.output)
     keypoints = person_keypoints(truth, 0.5)
     seconds = tuple(k / 25 for k in range(12))

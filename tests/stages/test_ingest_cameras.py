@@ -30,11 +30,11 @@ from stages.ingest.cameras.distortion import (
 from stages.ingest.cameras.extrinsics import FACING, interpolate_gaps, to_upright_world
 from stages.ingest.run import run
 from stages.ingest.video import Clip
-from tests.stages.camera_scene import (
+from tests.made.room import (
     centres_in_first,
     rotation_error,
 )
-from tests.stages.ingest_clips import make_context, walking_blob, write_clip, write_images, write_points
+from tests.made.videos import ingest_context, walking_blob, write_clip, write_images, write_points
 
 COUNT = 8
 SIZE = (128, 96)
@@ -52,7 +52,7 @@ def material(tmp_path: Path) -> Path:
 
 def ingest(material: Path, name: str = "run", **settings: object) -> Path:
     given = {"keypoints": str(material / "keypoints"), "masks": str(material / "masks"), **settings}
-    context = make_context(material / name, material / "clip.mp4", **given)
+    context = ingest_context(material / name, material / "clip.mp4", **given)
     run(context)
     return context.output
 

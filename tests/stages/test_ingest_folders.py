@@ -13,9 +13,9 @@ from pipeline.clip.keypoints import NAMES, read_keypoints
 from pipeline.clip.records import Split, read_cameras, read_footage, read_split
 from pipeline.errors import UserError
 from stages.ingest.run import run
-from tests.stages.ingest_clips import (
+from tests.made.videos import (
     body_points,
-    make_context,
+    ingest_context,
     walking_blob,
     write_clip,
     write_images,
@@ -37,7 +37,7 @@ def material(tmp_path: Path) -> Path:
 
 def ingest(material: Path, name: str = "run", source: str = "clip.mp4", **settings: object) -> Path:
     given = {"keypoints": str(material / "keypoints"), "masks": str(material / "masks"), **settings}
-    context = make_context(material / name, material / source, **given)
+    context = ingest_context(material / name, material / source, **given)
     run(context)
     return context.output
 
@@ -236,7 +236,7 @@ def test_an_unreadable_picture_in_a_folder(material: Path) -> None:
 
 def test_no_source(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="names no footage: add source="):
-        run(make_context(tmp_path, None))
+        run(ingest_context(tmp_path, None))
 
 
 def test_mediapipe_is_not_there(material: Path) -> None:

@@ -26,10 +26,10 @@ from stages.fit.initialise_from_poses import keep_given
 from stages.ingest.datasets.neuman import official_split
 from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
-from tests.stages import layout_writers as writers
-from tests.stages.fit_clip import BODY_FILE
-from tests.stages.ingest_clips import make_context
-from tests.stages.layout_footage import COUNT, FEW, SIZE, Take, footage, joints_and_surface, silhouette
+from tests.made import layouts as writers
+from tests.made.body import BODY_FILE
+from tests.made.layout_footage import COUNT, FEW, SIZE, Take, footage, joints_and_surface, silhouette
+from tests.made.videos import ingest_context
 
 STILL_STEPS = range(COUNT)
 
@@ -40,7 +40,7 @@ def shown():
 
 
 def ingest(tmp_path: Path, source: Path, **settings) -> Path:
-    context = make_context(tmp_path / "run", source, **settings)
+    context = ingest_context(tmp_path / "run", source, **settings)
     run(context)
     return context.output
 

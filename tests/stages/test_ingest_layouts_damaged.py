@@ -13,8 +13,8 @@ import pytest
 from pipeline.errors import UserError
 from stages.ingest.datasets import LAYOUTS, layout_of, open_recording
 from stages.ingest.settings import IngestSettings
-from tests.stages import layout_writers as writers
-from tests.stages.layout_footage import COUNT, footage
+from tests.made import layouts as writers
+from tests.made.layout_footage import COUNT, footage
 
 WRITERS = {
     "neuman": lambda folder, shown: writers.neuman(folder, shown, 0.4, True),

@@ -14,7 +14,7 @@ from pipeline.clip.records import read_footage, read_split
 from pipeline.errors import UserError
 from stages.ingest.run import run
 from stages.ingest.video import open_clip, read_clip
-from tests.stages.ingest_clips import make_context, write_images
+from tests.made.videos import ingest_context, write_images
 
 pytestmark = pytest.mark.assets
 
@@ -42,7 +42,7 @@ def noise(seed: int, shape: tuple[int, ...] = (360, 640, 3)) -> np.ndarray:
 
 def ingest(folder: Path, images: list[np.ndarray], mediapipe: Path, **settings: object) -> Path:
     source = write_images(folder / "pictures", images)
-    context = make_context(folder / "run", source, {"mediapipe": mediapipe}, **settings)
+    context = ingest_context(folder / "run", source, {"mediapipe": mediapipe}, **settings)
     run(context)
     return context.output
 

@@ -26,7 +26,7 @@ from stages.ingest.masks import (
 )
 from stages.ingest.people import Person
 from stages.ingest.split import split_frames
-from tests.stages.ingest_clips import walking_blob
+from tests.made.videos import walking_blob
 
 # People.
 

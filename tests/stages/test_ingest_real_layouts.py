@@ -15,7 +15,7 @@ from pipeline.pose_files import INITIAL_POSES
 from pipeline.run.job import open_job
 from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
-from tests.stages.ingest_clips import make_context
+from tests.made.videos import ingest_context
 
 JOINTS = (11, 12, 13, 14, 23, 24, 25, 26, 27, 28)
 HIP, KNEE = (JOINTS.index(23), JOINTS.index(24)), (JOINTS.index(25), JOINTS.index(26))
@@ -45,7 +45,7 @@ def triangulate(projections: list[np.ndarray], pixels: np.ndarray) -> np.ndarray
 @pytest.mark.assets
 def test_four_calibrated_cameras_see_one_person(tmp_path, assets_folder):
     assets = assets_of(assets_folder, "mediapipe", "balance")
-    context = make_context(
+    context = ingest_context(
         tmp_path, assets["balance"], {"mediapipe": assets["mediapipe"]}, test_cameras=("others",),
         stride=30, max_frames=len(FRAMES), background=False, mask_steadiness=0,
     )  # fmt: skip
@@ -93,7 +93,7 @@ def test_oliver_is_a_talkshow_clip_without_shows_file(tmp_path, assets_folder, s
     settings = job.settings["ingest"]
     assert settings.layout == "talkshow" and settings.test_frames == 30  # from the dataset's file
     fields = {name: getattr(settings, name) for name in settings.__dataclass_fields__}
-    context = make_context(tmp_path, clip, assets, **fields)
+    context = ingest_context(tmp_path, clip, assets, **fields)
     run(context)
     split = read_split(context.output / "split.json")
     assert len(split.test) == 30 and max(split.train) < min(split.test)

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.errors import UserError
 from stages.ingest.video import open_clip, read_clip
-from tests.stages.ingest_clips import numbered_images, turn_clip, write_clip, write_images
+from tests.made.videos import numbered_images, turn_clip, write_clip, write_images
 
 
 def red_corner(image: np.ndarray) -> str:

@@ -1,16 +1,13 @@
 """The mannequin: what it shows is what its truth says."""
 
-import contextlib
 import dataclasses
 import math
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.body import is_face, joint_index, load_body, load_landmarks, pose_body, rasterize, read_poses
+from pipeline.body import is_face, joint_index, pose_body, rasterize, read_poses
 from pipeline.clip.camera import project, to_camera
 from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import BODY, FACE, LEFT_HAND, read_keypoints
@@ -22,21 +19,12 @@ from stages.ingest.mannequin.motion import make_motion
 from stages.ingest.mannequin.person import make_identity
 from stages.ingest.mannequin.spec import mannequin_spec
 from stages.ingest.mannequin.truth import HIDDEN, OUTSIDE, SEEN, point_states, read_truth, seen_vertices
+from stages.ingest.settings import IngestSettings
+from tests.made.context import stage_context
 
-BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
 SIZE, FRAMES = 96, 5
 HALF_WAY = 2  # frame; a turning body faces away by then
 THRESHOLD = 0.4  # the score under which the method masks a point
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(BODY_FOLDER / "open_body.npz")
-
-
-@pytest.fixture(scope="module")
-def landmarks(body):
-    return load_landmarks(body, BODY_FOLDER)
 
 
 def spec_for(framing, **changes):
@@ -272,9 +260,9 @@ def test_specs_are_checked(wrong):
 
 
 def test_what_ingest_publishes_is_published(tmp_path, body):
-    settings = SimpleNamespace(
-        mannequin="head", mannequin_frames=4, mannequin_size=48,
-        mannequin_views=("left",), mannequin_view_stride=2, test_fraction=0.25, test_frames=0,
+    settings = IngestSettings(
+        mannequin="head", mannequin_frames=4, mannequin_size=48, mannequin_views=("left",),
+        mannequin_view_stride=2, test_fraction=0.25,
     )  # fmt: skip
     assert mannequin_spec(settings) == MannequinSpec(
         "head", frames=4, size=48, views=("left",), view_stride=2
@@ -282,19 +270,7 @@ def test_what_ingest_publishes_is_published(tmp_path, body):
     outputs = []
     for name in ("a", "b"):
         output = tmp_path / name
-        output.mkdir()
-        run_mannequin(
-            SimpleNamespace(
-                settings=settings,
-                source=None,
-                output=output,
-                body=BODY_FOLDER,
-                body_file=BODY_FOLDER / "open_body.npz",
-                log=lambda message: None,
-                timing=lambda name, value: None,
-                progress=lambda total, label: contextlib.nullcontext(SimpleNamespace(advance=lambda: None)),
-            )  # fmt: skip
-        )
+        run_mannequin(stage_context("ingest", settings, output))
         outputs.append(
             {str(f.relative_to(output)): f.read_bytes() for f in sorted(output.rglob("*")) if f.is_file()}
         )

@@ -1,25 +1,16 @@
 """Motion-capture files as the mannequin's motion."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.body import joint_index, load_body
+from pipeline.body import joint_index
 from pipeline.errors import UserError
 from pipeline.motion.bvh import read_bvh
 from stages.ingest.mannequin import MannequinSpec
 from stages.ingest.mannequin.motion import make_motion
-
-BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(BODY_FOLDER / "open_body.npz")
-
 
 ANGLES = "CHANNELS 3 Yrotation Xrotation Zrotation"
 ARM = """JOINT {0}Arm {{ OFFSET {1}18 35 0 {2}

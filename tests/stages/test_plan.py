@@ -9,7 +9,6 @@ import torch
 
 from pipeline.body import PARTS
 from pipeline.clip.camera import facing_camera
-from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.clip.keypoints import FACE, empty_keypoints, write_keypoints
 from pipeline.clip.plan import DECIDED, EFFECTS, SEEN_PARTS, read_plan
 from pipeline.clip.records import Split, read_footage, write_footage, write_split
@@ -21,7 +20,9 @@ from stages.ingest.cameras.background_motion import MOVING
 from stages.plan import decide, measure
 from stages.plan.run import run
 from stages.plan.settings import PlanSettings
-from tests.stages.train_subject import BODY_FILE, FRAMES, write_subject
+from tests.made.body import open_body
+from tests.made.context import stage_context
+from tests.made.portrait import FRAMES, write_subject
 
 AZIMUTH_CASES = [
     ((), 360.0, 12),
@@ -32,33 +33,45 @@ AZIMUTH_CASES = [
 ]
 
 
-@pytest.fixture
-def clip(tmp_path):
+def write_planned(folder):
     """Six frames of a head whose mouth opens, as ingest and fit would publish them."""
-    write_subject(tmp_path)
+    write_subject(folder)
     keypoints = empty_keypoints(np.arange(FRAMES))
     places = np.random.default_rng(0).uniform(8, 40, (68, 2))
     for row in range(FRAMES):
         keypoints.whole_body[row, FACE, :2] = places
         keypoints.whole_body[row, FACE, 2] = 0.9
         keypoints.whole_body[row, 71:91, 1] += 6 * np.sin(row / 2)
-    write_keypoints(tmp_path / "ingest" / "keypoints.parquet", keypoints)
+    write_keypoints(folder / "ingest" / "keypoints.parquet", keypoints)
     columns = {"frame": np.arange(FRAMES, dtype=np.int32), "pixels": np.full(FRAMES, 0.8, np.float32)}
-    write_table(tmp_path / "fit" / "residuals.parquet", measure.RESIDUALS, columns)
-    write_json(tmp_path / "fit" / "face.json", {"source": "auto", "frames": 6, "registered": 5})
+    write_table(folder / "fit" / "residuals.parquet", measure.RESIDUALS, columns)
+    write_json(folder / "fit" / "face.json", {"source": "auto", "frames": 6, "registered": 5})
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """The head's folders, which a test may change."""
+    write_planned(tmp_path)
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """What is measured of the head."""
+    folder = tmp_path_factory.mktemp("head")
+    write_planned(folder)
+    return measure.read_inputs(folder / "ingest", folder / "fit", open_body())
+
+
+@pytest.fixture(scope="module")
+def usual(inputs):
+    """Its plan, nothing overridden."""
+    return decide.decide(inputs, PlanSettings())
+
+
 def context_of(clip, **settings):
-    output = clip / "out"
-    output.mkdir(exist_ok=True)
-    return SimpleNamespace(
-        inputs={name: clip / name for name in ("ingest", "fit")},
-        settings=PlanSettings(**settings),
-        body_file=BODY_FILE,
-        output=output,
-        log=lambda line: None,
-    )
+    inputs = {name: clip / name for name in ("ingest", "fit")}
+    return stage_context("plan", PlanSettings(**settings), clip / "out", inputs)
 
 
 def planned(clip, **settings):
@@ -67,8 +80,8 @@ def planned(clip, **settings):
     return read_plan(context.output / "plan.json")
 
 
-def test_a_head_calls_for_what_a_head_has(clip):
-    plan = planned(clip)
+def test_a_head_calls_for_what_a_head_has(usual):
+    plan = usual
     on = {name for name in EFFECTS if plan.on(name)}
     assert {"face_registration", "face_residual", "face_loss", "visibility_gate"} <= on
     assert {"auxiliary_views", "pose_refinement", "pose_heads", "seen_head", "seen_face"} <= on
@@ -82,9 +95,9 @@ def test_a_head_calls_for_what_a_head_has(clip):
 @pytest.mark.parametrize(
     ("pixels", "levels"), [(0.0, 0), (0.7, 0), (1.5, 0), (1.6, 1), (3.0, 1), (3.1, 2), (6.1, 3)]
 )
-def test_gaussians_are_as_fine_as_the_pixels(clip, monkeypatch, pixels, levels):
+def test_gaussians_are_as_fine_as_the_pixels(inputs, monkeypatch, pixels, levels):
     monkeypatch.setattr(decide, "gaussian_pixels", lambda inputs: pixels)
-    made = planned(clip)["subdivision"]
+    made = decide.subdivision(inputs)
     assert made.on == (levels > 0) and made.values == (levels,) and made.measured == pixels
 
 
@@ -95,22 +108,25 @@ def test_pixels_between_vertices_are_those_of_a_known_grid():
     quads = torch.stack([corner, corner + 1, corner + 12, corner, corner + 12, corner + 11], 1)
     faces = quads.reshape(-1, 3)  # round to the left seen from +Z, where the camera stands
     camera = facing_camera(400, 400, 300.0)
-    assert measure._spacing(grid.reshape(-1, 3), faces, camera) == pytest.approx(300 * 0.02 / 2, rel=1e-5)
-    assert measure._spacing(grid.reshape(-1, 3), faces.flip(1), camera) == 0  # turned away
-    behind = grid.reshape(-1, 3) * torch.tensor([1.0, 1.0, -1.0])
-    assert measure._spacing(behind, faces, camera) == 0
-    assert measure._spacing(grid.reshape(-1, 3) + 5, faces, camera) == 0  # outside of the picture
+    grid = grid.reshape(-1, 3)
+    assert measure.vertex_spacing(grid, faces, camera) == pytest.approx(300 * 0.02 / 2, rel=1e-5)
+    assert measure.vertex_spacing(grid, faces.flip(1), camera) == 0  # turned away
+    behind = grid * torch.tensor([1.0, 1.0, -1.0])
+    assert measure.vertex_spacing(behind, faces, camera) == 0
+    assert measure.vertex_spacing(grid + 5, faces, camera) == 0  # outside of the picture
 
 
-def test_a_picture_of_half_the_size_halves_the_pixels_between_vertices(clip):
-    whole = measure.read_inputs(clip / "ingest", clip / "fit", BODY_FILE)
-    half = {frame: one.resized(one.width // 2, one.height // 2) for frame, one in whole.cameras.items()}
-    ratio = measure.gaussian_pixels(whole) / measure.gaussian_pixels(dataclasses.replace(whole, cameras=half))
+def test_a_picture_of_half_the_size_halves_the_pixels_between_vertices(inputs):
+    half = {frame: one.resized(one.width // 2, one.height // 2) for frame, one in inputs.cameras.items()}
+    smaller = dataclasses.replace(inputs, cameras=half)
+    ratio = measure.gaussian_pixels(inputs) / measure.gaussian_pixels(smaller)
     assert ratio == pytest.approx(2, rel=0.02)
 
 
-def test_finer_edges_call_for_more_gaussians_and_training_is_told_how_fine(clip):
-    coarse, fine = (planned(clip, edge_pixels=edge)["gaussians"] for edge in (100.0, 1.0))
+def test_finer_edges_call_for_more_gaussians_and_training_is_told_how_fine(inputs):
+    coarse, fine = (
+        decide.decide(inputs, PlanSettings(edge_pixels=edge))["gaussians"] for edge in (100.0, 1.0)
+    )
     assert fine.threshold == 1.0 and sum(fine.values) > 2 * sum(coarse.values) > 0
     legs = [PARTS.index(part) for part in ("left_leg", "right_leg")]
     assert not any(fine.values[place] for place in legs)  # no frame shows them
@@ -130,23 +146,19 @@ def test_equal_inputs_give_equal_bytes(clip):
 
 
 @pytest.mark.parametrize("effect", [*DECIDED, *SEEN_PARTS])
-def test_any_decision_is_overridden_from_the_command_line(clip, effect):
-    usual = PLANS.setdefault("auto", planned(clip))[effect]
-    choice = "off" if usual.on else "on"
+def test_any_decision_is_overridden_from_the_command_line(inputs, usual, effect):
+    choice = "off" if usual.on(effect) else "on"
     words = command_line_layer({f"plan.{effect}": choice})
     settings = resolve({"plan": PlanSettings}, [words])["plan"]
-    made = planned(clip, **dataclasses.asdict(settings))[effect]
-    assert made.on != usual.on and made.forced and made.measured == usual.measured
-    assert f"plan.{effect}={choice}" in made.why and usual.why in made.why
+    made = decide.decide(inputs, settings)[effect]
+    assert made.on != usual.on(effect) and made.forced and made.measured == usual[effect].measured
+    assert f"plan.{effect}={choice}" in made.why and usual[effect].why in made.why
 
 
-PLANS: dict = {}
-
-
-def test_a_part_that_is_said_to_be_unseen_gets_no_residual(clip):
-    plan = planned(clip, seen_face="off")
+def test_a_part_that_is_said_to_be_unseen_gets_no_residual(inputs):
+    plan = decide.decide(inputs, PlanSettings(seen_face="off"))
     assert not plan.on("face_residual") and not plan["face_residual"].forced
-    assert planned(clip, seen_face="off", face_residual="on").on("face_residual")
+    assert decide.decide(inputs, PlanSettings(seen_face="off", face_residual="on")).on("face_residual")
 
 
 def test_what_ingest_and_fit_were_told_counts_as_set(clip):
@@ -182,8 +194,8 @@ def test_numbers_that_stand_in_two_places_agree():
 
 
 @pytest.mark.parametrize(("degrees", "widest", "count"), AZIMUTH_CASES)
-def test_azimuths_that_no_frame_shows(clip, degrees, widest, count):
-    whole = read_fitted_clip(clip / "ingest", clip / "fit", BODY_FILE)
+def test_azimuths_that_no_frame_shows(inputs, degrees, widest, count):
+    whole = inputs.clip
     poses = whole.poses
     rotation = poses.rotation[:1].repeat(max(1, len(degrees)), 1, 1)
     for row, angle in enumerate(degrees):  # the body turned away by an angle is seen from minus that

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pipeline.avatar import load_avatar
-from pipeline.body import Poses, load_body, read_poses, write_poses
+from pipeline.body import Poses, read_poses
 from pipeline.body import poses as poses_module
 from pipeline.clip import curves
 from pipeline.clip.fitted_clip import read_fitted_clip
@@ -14,49 +14,56 @@ from pipeline.errors import UserError
 from pipeline.files.tables import read_table
 from pipeline.splat import render
 from stages.train import run as stage
-from stages.train.checkpoint import NAME, Checkpoint, read_checkpoint, run_key, write_checkpoint
 from stages.train.held_out import held_out_psnr
 from stages.train.loop import Trainer
 from stages.train.visibility_gate import SCHEMA
-from tests.stages.train_subject import BODY_FILE, change_loss, context_for, trainer_for, write_subject
+from tests.made.portrait import (
+    bytes_of,
+    change_loss,
+    context_for,
+    run_counted,
+    trainer_for,
+    with_poses,
+)
 
 PUBLISHED = {
     "avatar.safetensors", "curve.parquet", "gate.json", "poses.parquet", "visibility.parquet",
     "visibility.png",
 }  # fmt: skip
+KINDS = {"triplane": {}, "bases": {"representation": "bases", "bases": 1}}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    """A representation, as settings name it."""
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def finished(subject):
-    """One uninterrupted run."""
-    context = context_for(subject, subject / "finished")
+def finished(kind, subject, tmp_path_factory):
+    """What one uninterrupted run publishes."""
+    context = context_for(subject, tmp_path_factory.mktemp(kind) / "finished", **KINDS[kind])
     stage.run(context)
     return context.output
 
 
-def bytes_of(folder) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+@pytest.fixture(scope="module")
+def learnt(finished, body):
+    """Its avatar, read back."""
+    return load_avatar(finished / "avatar.safetensors", body)
 
 
-def test_publishes_everything_and_all_of_it_finite(finished):
+only_triplane = pytest.mark.parametrize("kind", ["triplane"], indirect=True)
+only_bases = pytest.mark.parametrize("kind", ["bases"], indirect=True)
+
+
+def test_publishes_everything_and_all_of_it_finite(kind, finished, learnt):
     assert set(bytes_of(finished)) == PUBLISHED
     rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")
-    expected = {"l1", "ssim", "face", "laplacian_offset", "residual_size", "psnr", "gaussians"}
-    assert expected <= set(rows["name"])
+    expected = {"l1", "ssim", "face", "laplacian_offset", "psnr", "gaussians"}
+    assert expected | ({"residual_size"} if kind == "triplane" else set()) <= set(rows["name"])
     assert set(rows["iteration"]) == {6, 12}
-
-
-def test_same_seed_same_bytes(subject, finished, tmp_path):
-    again = context_for(subject, tmp_path / "again")
-    stage.run(again)
-    assert bytes_of(again.output) == bytes_of(finished)
+    assert all(bool(tensor.isfinite().all()) for tensor in learnt.state_dict().values())
 
 
 def test_another_seed_another_avatar(subject, tmp_path):
@@ -69,58 +76,18 @@ def test_another_seed_another_avatar(subject, tmp_path):
     assert not torch.equal(weights[0], weights[2])
 
 
-class Killed(BaseException):
-    """Stands for a kill: nothing of ours catches it."""
-
-
-def test_killed_and_rerun_gives_the_same_bytes(subject, finished, tmp_path, monkeypatch):
-    context = context_for(subject, tmp_path / "out")
-    original = Trainer.step
-
-    def step(self):
-        if self.iteration == 8:
-            raise Killed
-        return original(self)
-
-    monkeypatch.setattr(Trainer, "step", step)
-    with pytest.raises(Killed):
-        stage.run(context)
+def test_killed_and_rerun_gives_the_same_bytes(kind, subject, finished, tmp_path, monkeypatch):
+    context = context_for(subject, tmp_path / "out", **KINDS[kind])
+    run_counted(context, monkeypatch, kill_at=8)
     assert not list(context.output.iterdir())
-    assert (context.work / NAME).exists()
-    monkeypatch.undo()
-    messages, timings = [], {}
-    context.log, context.timing = messages.append, timings.__setitem__
-    stage.run(context)
-    assert any("goes on from iteration 5" in message for message in messages)
+    assert run_counted(context, monkeypatch) == list(range(5, 12))  # a checkpoint every five iterations
     assert bytes_of(context.output) == bytes_of(finished)
     # What the killed process took up to its checkpoint is not forgotten.
+    timings = context.timings
     iterations, wall, cpu = zip(*timings["curve_seconds"], strict=True)
     assert iterations == (6, 12) and sorted(wall) == list(wall) and sorted(cpu) == list(cpu)
     assert 0 < timings["earlier_seconds"] < wall[0] and 0 < timings["earlier_cpu_seconds"] < cpu[0]
     assert timings["train_seconds"] >= wall[-1]
-
-
-def test_checkpoint_of_another_run_is_left_alone(tmp_path):
-    written = Checkpoint(5, "this run", {"weight": torch.arange(3.0)}, {"rows": [[1, "l1", 0.5]]})
-    write_checkpoint(tmp_path, written)
-    assert read_checkpoint(tmp_path, "another run") is None
-    read = read_checkpoint(tmp_path, "this run")
-    assert read.iteration == 5 and read.extra == written.extra
-    assert torch.equal(read.tensors["weight"], torch.arange(3.0))
-    assert [path.name for path in tmp_path.iterdir()] == [NAME]
-
-
-def test_run_key_changes_with_settings_and_inputs():
-    poses = torch.zeros(4, 3)
-    key = run_key({"seed": 0}, [poses])
-    assert key == run_key({"seed": 0}, [poses.clone()])
-    assert len({key, run_key({"seed": 1}, [poses]), run_key({"seed": 0}, [poses + 1])}) == 3
-
-
-@pytest.mark.parametrize("size", [0, 100, 5000])
-def test_cut_off_checkpoint_is_no_checkpoint(tmp_path, size):
-    (tmp_path / NAME).write_bytes(b"\x10" * size)
-    assert read_checkpoint(tmp_path, "key") is None
 
 
 def test_training_comes_closer_to_the_training_frames(subject, tmp_path):
@@ -152,12 +119,12 @@ def test_initial_colors_are_near_the_truth(subject, tmp_path):
     assert held_out_psnr(trainer, frames) > held_out_psnr(grey, frames) + 5
 
 
-def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, tmp_path):
+@only_triplane
+def test_gate_keeps_what_is_seen_and_its_surroundings(subject, finished, body, tmp_path):
     table = read_table(finished / "visibility.parquet", SCHEMA, "")
     seen, kept = table["captured"] > 0, table["kept"]
     assert kept[seen].all() and 0 < seen.sum() < kept.sum() < len(kept) / 2
     assert not table["generated"].any() and not (table["early"] & kept).any()
-    body = load_body(BODY_FILE)
     assert body.v_template[~torch.from_numpy(kept), 1].min() < -1  # the feet are gone
     context = context_for(subject, tmp_path / "open", gate=False)
     assert len(trainer_for(context).avatar) == len(kept)
@@ -180,13 +147,11 @@ def test_only_drawn_frames_move(subject, tmp_path):
     assert len(moved) == 2
 
 
-def test_published_avatar_renders_the_held_out_frame(subject, finished):
-    body = load_body(BODY_FILE)
-    avatar = load_avatar(finished / "avatar.safetensors", body)
+def test_published_avatar_renders_the_held_out_frame(subject, finished, learnt, body):
     clip = read_fitted_clip(subject / "ingest", subject / "fit", body)
     view = clip.view(5)
     with torch.no_grad():
-        gaussians = avatar.gaussians(clip.pose(5), clip.seconds[5])
+        gaussians = learnt.gaussians(clip.pose(5), clip.seconds[5])
         rendering = render(gaussians, view.camera)
     error = (rendering.color - view.composite(torch.zeros(3))).square().mean()
     curve_rows = read_table(finished / "curve.parquet", curves.SCHEMA, "")
@@ -194,12 +159,22 @@ def test_published_avatar_renders_the_held_out_frame(subject, finished):
     assert -10 * torch.log10(error) == pytest.approx(float(last[0]), abs=0.05)
 
 
-def test_published_avatar_has_learnt_residuals_of_what_is_seen(finished):
-    avatar = load_avatar(finished / "avatar.safetensors", load_body(BODY_FILE))
-    assert list(avatar.representation.residuals.heads) == ["face"]  # the hands hang below the picture
-    assert avatar.residuals_active and avatar.pose_heads_active
-    torch.testing.assert_close(avatar.representation.residuals.time_range, torch.tensor([0.5, 0.9]))
-    assert bool((avatar.representation.residuals.heads["face"].last.weight != 0).any())
+@only_triplane
+def test_published_avatar_has_learnt_residuals_of_what_is_seen(learnt):
+    residuals = learnt.representation.residuals
+    assert list(residuals.heads) == ["face"]  # the hands hang below the picture
+    assert learnt.residuals_active and learnt.pose_heads_active
+    torch.testing.assert_close(residuals.time_range, torch.tensor([0.5, 0.9]))
+    assert bool((residuals.heads["face"].last.weight != 0).any())
+
+
+@only_bases
+def test_published_avatar_has_learnt_bases_of_what_is_seen(learnt):
+    assert (learnt.architecture.representation, learnt.architecture.bases) == ("bases", 1)
+    assert not learnt.architecture.residual_parts and learnt.pose_heads_active
+    made = learnt.representation
+    assert all(bool((one != 0).any()) for one in (made.offset, made.log_scale, made.color, made.bases))
+    assert bool((made.bases == 0).all(1).any())  # the back of the head was never seen
 
 
 def test_residuals_can_be_left_out(subject, tmp_path):
@@ -243,17 +218,6 @@ def test_weight_that_is_not_finite_is_never_published(subject, tmp_path, monkeyp
     assert not list(context.output.iterdir())
 
 
-def altered(subject, folder, change):
-    """A copy of the subject whose poses went through ``change``."""
-    (folder / "fit").mkdir(parents=True)
-    for path in (subject / "fit").iterdir():
-        (folder / "fit" / path.name).write_bytes(path.read_bytes())
-    for name in ("ingest", "plan"):
-        (folder / name).symlink_to(subject / name)
-    write_poses(folder / "fit" / "poses.parquet", change(read_poses(subject / "fit" / "poses.parquet")))
-    return context_for(folder, folder / "out")
-
-
 def without_last(poses: Poses) -> Poses:
     return Poses(poses.frames[:-1], poses.rotation[:-1], poses.expression[:-1], poses.transl[:-1])
 
@@ -269,7 +233,7 @@ def without_last(poses: Poses) -> Poses:
 def test_poses_that_cannot_be_used_say_what_to_do(subject, tmp_path, change, message, monkeypatch):
     monkeypatch.setattr(poses_module, "rows_not_finite", lambda values: [])  # somebody else wrote them
     with pytest.raises(UserError, match=message) as caught:
-        stage.run(altered(subject, tmp_path / "altered", change))
+        stage.run(context_for(with_poses(subject, tmp_path / "altered", change), tmp_path / "out"))
     assert "fit" in str(caught.value)
 
 

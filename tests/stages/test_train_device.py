@@ -5,18 +5,19 @@ import importlib
 import pytest
 import torch
 
+from pipeline.avatar import evidence, load_avatar
 from pipeline.avatar import head as heads
-from pipeline.avatar import load_avatar
 from pipeline.avatar import skinning_tables as posing
-from pipeline.body import Pose, load_body
+from pipeline.body import Pose
 from pipeline.clip import curves
 from pipeline.device import moved
 from pipeline.files.tables import read_table
 from pipeline.splat import render
-from stages.train import held_out, initial_colors, loop, objective
+from stages.train import held_out, objective
 from stages.train import run as stage
+from tests.made.body import open_body
+from tests.made.portrait import context_for, data_for, run_counted
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
-from tests.stages.train_subject import BODY_FILE, context_for, data_for, write_subject
 
 ALL_ON = {
     "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0, "half_precision": False, "batch": 2,
@@ -25,14 +26,7 @@ ALL_ON = {
     "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, held_out, initial_colors)
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    return folder
+RENDERERS = (objective, held_out, evidence)
 
 
 def without_kernels(monkeypatch):
@@ -101,7 +95,7 @@ def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_
         stage.run(there)
     ours, theirs = curve_of(here.output), curve_of(there.output)
     assert theirs == pytest.approx(ours, rel=2e-2)
-    avatars = [load_avatar(one.output / "avatar.safetensors", load_body(BODY_FILE)) for one in (here, there)]
+    avatars = [load_avatar(one.output / "avatar.safetensors", open_body()) for one in (here, there)]
     assert all(tensor.device.type == "cpu" for tensor in avatars[1].state_dict().values())
     assert torch.equal(avatars[0].active, avatars[1].active)
     still = Pose(torch.zeros(55, 3), torch.zeros(5), torch.zeros(3))
@@ -113,24 +107,11 @@ def test_a_run_elsewhere_leaves_nothing_on_the_cpu_and_is_the_same(subject, tmp_
 @pytest.mark.slow
 def test_a_checkpoint_from_elsewhere_is_gone_on_from_on_the_cpu(subject, tmp_path, monkeypatch):
     pretend(monkeypatch)
-    original, context = loop.Trainer.step, context_for(subject, tmp_path / "out", **ALL_ON)
-
-    class Killed(BaseException):
-        pass
-
-    def step(self):
-        if self.iteration == 3:
-            raise Killed
-        return original(self)
-
-    monkeypatch.setattr(stage.Trainer, "step", step)
-    with pretend_device(), pytest.raises(Killed):
-        stage.run(context)
+    context = context_for(subject, tmp_path / "out", **ALL_ON)
+    with pretend_device():
+        run_counted(context, monkeypatch, kill_at=3)
     monkeypatch.undo()
-    messages = []
-    context.log = messages.append
-    stage.run(context)
-    assert any("goes on from iteration 2" in message for message in messages)
+    assert run_counted(context, monkeypatch) == list(range(2, 6))
     assert (context.output / "avatar.safetensors").exists()
 
 

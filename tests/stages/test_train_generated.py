@@ -16,26 +16,19 @@ from pipeline.files.tables import read_table
 from stages.train import run as stage
 from stages.train.generated import GeneratedFrames, read_generated
 from stages.train.visibility_gate import SCHEMA
-from tests.stages.train_subject import context_for, data_for, write_subject
+from tests.made.portrait import context_for, data_for
 
 FIRST = 100_000
 
 
 @pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    write_generated(folder, trust=255)
-    return folder
-
-
-def write_generated(folder, trust: int, count: int = 3) -> None:
-    """Green frames of another size, of the subject turned by half."""
-    made = folder / "auxiliary"
+def generated(subject, tmp_path_factory):
+    """Three green frames of another size, of the subject turned by half, as auxiliary publishes them."""
+    made, count = tmp_path_factory.mktemp("auxiliary"), 3
     for kind in ("frames", "masks", "trust"):
         (made / kind).mkdir(parents=True, exist_ok=True)
-    poses = read_poses(folder / "fit" / "poses.parquet")
-    camera: Camera = read_cameras(folder / "ingest" / "cameras.parquet")[0].resized(36, 48)
+    poses = read_poses(subject / "fit" / "poses.parquet")
+    camera: Camera = read_cameras(subject / "ingest" / "cameras.parquet")[0].resized(36, 48)
     rotation = poses.rotation[:count].clone()
     rotation[:, 0] = torch.tensor([0.0, torch.pi, 0.0])
     numbers = tuple(FIRST + k for k in range(count))
@@ -46,28 +39,24 @@ def write_generated(folder, trust: int, count: int = 3) -> None:
     for frame in numbers:
         write_frame(made / "frames", frame, np.full((48, 36, 3), (0, 255, 0), np.uint8))
         write_mask(made / "masks", frame, np.full((48, 36), 255, np.uint8))
-        write_mask(made / "trust", frame, np.full((48, 36), trust, np.uint8))
+        write_mask(made / "trust", frame, np.full((48, 36), 255, np.uint8))
     write_json(made / "auxiliary.json", {"kept": count})
+    return made
 
 
 @pytest.fixture(scope="module")
-def objective(subject, tmp_path_factory):
-    return objective_of(subject, tmp_path_factory.mktemp("o") / "out", face=0.8, pose_change=1.0)
-
-
-def inputs_of(subject, output, **changes):
-    context = context_for(subject, output, **changes)
-    context.inputs["auxiliary"] = subject / "auxiliary"
-    return context
-
-
-def objective_of(subject, output, **changes):
-    context = inputs_of(subject, output, **changes)
+def objective(subject, generated, tmp_path_factory):
+    context = context_of(subject, generated, tmp_path_factory.mktemp("o") / "out", face=0.8, pose_change=1.0)
     return stage.build_trainer(data_for(context), context.settings).objective
 
 
-def test_frames_have_their_own_size_camera_and_trust(subject, tmp_path):
-    data = data_for(inputs_of(subject, tmp_path / "out"))
+def context_of(subject, generated, output, **changes):
+    context = context_for(subject, output, **changes)
+    return dataclasses.replace(context, inputs={**context.inputs, "auxiliary": generated})
+
+
+def test_frames_have_their_own_size_camera_and_trust(subject, generated, tmp_path):
+    data = data_for(context_of(subject, generated, tmp_path / "out"))
     view = data.view(FIRST)
     assert view.generated and view.color.shape == (48, 36, 3) and view.camera.width == 36
     assert view.trust is not None and bool((view.trust == 1).all())
@@ -109,8 +98,8 @@ def test_initial_colours_of_the_unseen_side_are_the_generated_ones(objective):
     assert (torch.sigmoid(with_them.base_color[front])[:, 1] > 0.9).float().mean() < 0.2
 
 
-def test_a_run_publishes_captured_poses_only_and_counts_apart(subject, tmp_path):
-    context = inputs_of(subject, tmp_path / "out")
+def test_a_run_publishes_captured_poses_only_and_counts_apart(subject, generated, tmp_path):
+    context = context_of(subject, generated, tmp_path / "out")
     stage.run(context)
     assert read_poses(context.output / "poses.parquet").frames == tuple(range(6))
     table = read_table(context.output / "visibility.parquet", SCHEMA, "")
@@ -123,8 +112,8 @@ def test_nothing_published_is_nothing_read(subject, tmp_path):
     assert read_generated(None, poses) is None and read_generated(tmp_path, poses) is None
 
 
-def test_frames_of_another_fit_are_refused(subject):
+def test_frames_of_another_fit_are_refused(subject, generated):
     poses = read_poses(subject / "fit" / "poses.parquet")
     other = Poses(poses.frames, poses.rotation, torch.zeros(len(poses), 9), poses.transl)
     with pytest.raises(UserError, match="another fit"):
-        read_generated(subject / "auxiliary", other)
+        read_generated(generated, other)

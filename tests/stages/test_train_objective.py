@@ -14,7 +14,7 @@ from stages.train.initial_avatar import initial_avatar
 from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings
-from tests.stages.train_subject import context_for, data_for, write_subject
+from tests.made.portrait import context_for, data_for
 
 ALL_ON = {
     "pose_noise": 0.0, "pose_heads_from": 0.0, "residual_from": 0.0, "refine_from": 0.0,
@@ -27,13 +27,6 @@ class Brightness(nn.Module):
 
     def forward(self, image, target):
         return (image.double().mean() - target.double().mean()).abs()[None].float()
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("subject")
-    write_subject(folder)
-    return folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,9 +72,9 @@ def scene(subject, output, **changes) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def objective(subject):
+def objective(subject, tmp_path_factory):
     """Makes objectives over one avatar; ``changes`` are settings of the objective."""
-    return scene(subject, subject / "gated").objective
+    return scene(subject, tmp_path_factory.mktemp("gated") / "out").objective
 
 
 def gradients(objective: TrainingObjective, iterations: range, only: str = "") -> dict[str, torch.Tensor]:
@@ -200,8 +193,8 @@ def test_lpips_begins_when_it_is_told_to(objective):
     assert ["lpips" in late(iteration, 0, False) for iteration in (5, 6, 11)] == [False, True, True]
 
 
-def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject):
-    whole = scene(subject, subject / "whole", gate=False).objective
+def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject, tmp_path):
+    whole = scene(subject, tmp_path / "whole", gate=False).objective
     optional = {"hand_normal", "scale_size", "scale_growth", "hand_color", "arm_color"}
     none = whole(scale_growth=0.0)(0, 0, False)
     every = whole(**dict.fromkeys(optional, 1.0))(0, 0, False)

@@ -7,27 +7,18 @@ import pytest
 import torch
 
 from pipeline.avatar import load_avatar
-from pipeline.body import Pose, load_body
+from pipeline.body import Pose
 from pipeline.clip.plan import Decision, Plan
 from pipeline.files.tables import read_table
 from pipeline.untrusted import parse_json
 from stages.train import run as stage
-from stages.train.checkpoint import NAME
-from stages.train.loop import Trainer
 from stages.train.settings import apply_plan
 from stages.train.visibility_gate import SCHEMA, VisibilityGate, ever_in_frame
-from tests.plans import plan_of
-from tests.stages.test_train import Killed, bytes_of
-from tests.stages.train_subject import BODY_FILE, TINY, context_for, data_for, trainer_for, write_subject
+from tests.made.body import open_body
+from tests.made.plans import plan_of
+from tests.made.portrait import TINY, bytes_of, context_for, data_for, run_counted, trainer_for
 
 LATE = {"early_gate": False, "gate_from": 0.25, "gate_every": 2, "iterations": 12}
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("gated")
-    write_subject(folder)
-    return folder
 
 
 @pytest.fixture
@@ -118,16 +109,15 @@ def test_what_comes_into_view_later_returns(trainer):
     assert trainer.avatar.active[hand].all()
 
 
-def test_generated_frames_are_counted_apart_and_keep_what_they_show(trainer):
+@pytest.mark.parametrize(("unseen", "kept"), [("generated", True), ("nothing", False)])
+def test_generated_frames_are_counted_apart_and_keep_what_they_show(subject, tmp_path, unseen, kept):
+    trainer = trainer_for(context_for(subject, tmp_path / "out", **LATE, unseen=unseen))
     gate, avatar = trainer.hooks["gate"], trainer.avatar
     face, leg = (avatar.surfaces[0].canonical.is_part(part) for part in ("face", "left_leg"))
     gate.drawn[:] = 4
     gate.hits[0], gate.hits[1] = 4 * face, 4 * leg
     gate.update()
-    assert avatar.active[face].all() and avatar.active[leg].all()
-    gate._settings = dataclasses.replace(gate._settings, unseen="nothing")
-    gate.update()
-    assert avatar.active[face].all() and not avatar.active[leg].all()
+    assert avatar.active[face].all() and bool(avatar.active[leg].all()) == kept
 
 
 def test_full_body_in_view_keeps_the_gate_open(trainer):
@@ -155,19 +145,8 @@ def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tm
     whole = context_for(subject, tmp_path / "whole", **LATE | looks)
     stage.run(whole)
     context = context_for(subject, tmp_path / "out", **LATE | looks)
-    original = Trainer.step
-
-    def step(self):
-        if self.iteration == 8:
-            raise Killed
-        return original(self)
-
-    monkeypatch.setattr(Trainer, "step", step)
-    with pytest.raises(Killed):
-        stage.run(context)
-    assert (context.work / NAME).exists()
-    monkeypatch.undo()
-    stage.run(context)
+    run_counted(context, monkeypatch, kill_at=8)
+    assert run_counted(context, monkeypatch) == list(range(5, 12))
     assert bytes_of(context.output) == bytes_of(whole.output)
     found = parse_json(context.output / "gate.json", "")
     assert found["drawn"] == {"captured": 12, "generated": 0} and found["tau"] > 0
@@ -189,7 +168,7 @@ def test_finer_level_is_gated_as_the_coarse_one(subject, tmp_path):
 def test_finished_avatar_shows_nothing_or_the_base_where_nothing_was_seen(subject, tmp_path, unseen):
     context = context_for(subject, tmp_path / "out", unseen=unseen)
     stage.run(context)
-    body = load_body(BODY_FILE)
+    body = open_body()
     avatar = load_avatar(context.output / "avatar.safetensors", body)
     kept = read_table(context.output / "visibility.parquet", SCHEMA, "")["kept"]
     expression = torch.zeros(avatar.surfaces[0].canonical.expression_directions.shape[-1])

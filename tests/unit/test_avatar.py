@@ -10,18 +10,12 @@ from safetensors.torch import save_file
 
 from pipeline.avatar import Architecture, Avatar, build_canonical, load_avatar, pose_features, save_avatar
 from pipeline.avatar.canonical import dilate, tangent_frames, tangent_spacing
-from pipeline.body import Identity, Pose, load_body, mean_identity, posed_vertices, vertex_normals
+from pipeline.body import Identity, Pose, mean_identity, posed_vertices, vertex_normals
 from pipeline.clip.camera import facing_camera
-from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.splat import render
 
 SMALL = Architecture(plane_resolution=8, plane_channels=2, width=8, groups=2, subdivisions=1)
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
 
 
 @pytest.fixture(scope="module")

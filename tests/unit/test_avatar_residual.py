@@ -8,8 +8,7 @@ import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.residual import PLACES, REST, encode, part_rows
-from pipeline.body import Pose, load_body, mean_identity
-from pipeline.config.workspace import REPOSITORY
+from pipeline.body import Pose, mean_identity
 
 SMALL = Architecture(
     plane_resolution=8,
@@ -21,11 +20,6 @@ SMALL = Architecture(
     residual_width=8,
 )
 REFINED = ("face", "left_hand", "right_hand")
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
 
 
 @pytest.fixture(scope="module")

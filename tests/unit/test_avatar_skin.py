@@ -1,20 +1,13 @@
 """Skinning weights of moved points: taken from the original vertex that lies nearest."""
 
-import pytest
 import torch
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.skinning_tables import OWN, nearest_rows
-from pipeline.body import Pose, load_body, mean_identity
-from pipeline.config.workspace import REPOSITORY
+from pipeline.body import Pose, mean_identity
 
 POSE = torch.zeros(55, 3)
 POSE[16, 2], POSE[18, 1] = -1.0, -0.7  # the left arm down and bent
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
 
 
 def an_avatar(body) -> Avatar:
@@ -37,6 +30,7 @@ def test_nearest_rows_by_hand():
 def test_reskinned_points_have_the_weights_of_the_nearest_vertex(body):
     avatar = an_avatar(body)
     before, decoded = avatar.surfaces[-1].canonical.skinning_weights, avatar.decode()
+    taken = avatar.surfaces[0].canonical.skinning_weights
     with torch.no_grad():
         avatar.reskin()
     points = decoded.surface.canonical.vertices + decoded.offset.detach()
@@ -45,7 +39,6 @@ def test_reskinned_points_have_the_weights_of_the_nearest_vertex(body):
     assert bool(still.any()) and torch.equal(after[still], before[still])  # head and hands
     moved = torch.nonzero(~still)[::97, 0]
     nearest = torch.cdist(points[moved], original.vertices).argmin(1)
-    taken = avatar._own_surfaces[0].canonical.skinning_weights
     torch.testing.assert_close(after[moved], taken[nearest], rtol=0, atol=0)
     assert not torch.equal(after, before)
 

@@ -11,10 +11,10 @@ from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar.bake import bake
 from pipeline.avatar.fused_head import HeadParameters, decode
 from pipeline.avatar.head import Head
-from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points, normals_of_vertices
-from pipeline.body import Pose, load_body, mean_identity, vertex_normals
+from pipeline.avatar.skinning_kernels import normals_of_vertices
+from pipeline.avatar.skinning_tables import faces_of_vertices, joints_of_points
+from pipeline.body import Pose, mean_identity, vertex_normals
 from pipeline.clip.camera import facing_camera
-from pipeline.config.workspace import REPOSITORY
 from pipeline.numba_kernels import threads
 from pipeline.splat import render
 from stages.evaluate.methods import baked_animation
@@ -29,11 +29,6 @@ def one_thread():
     numba.get_num_threads()  # its pool, when it starts, sets torch's number of threads
     with threads(1):
         yield
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data" / "body" / "open_body.npz")
 
 
 def an_avatar(body, architecture=SMALL, half_precision=False, directions=None) -> Avatar:

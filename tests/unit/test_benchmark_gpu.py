@@ -8,14 +8,14 @@ import torch
 
 from benchmarks import gpu, step
 from benchmarks.avatars import avatar_of
-from pipeline.avatar import Architecture
+from pipeline.avatar import Architecture, evidence
 from pipeline.clip.plan import read_plan
 from pipeline.device import moved
 from pipeline.splat import render
-from stages.train import held_out, initial_colors, objective
+from stages.train import held_out, objective
 from stages.train.settings import apply_plan
+from tests.made.portrait import context_for, data_for
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
-from tests.stages.train_subject import context_for, data_for, write_subject
 
 SMALL = {"plane_resolution": 8, "plane_channels": 2, "width": 16, "groups": 4}
 
@@ -29,12 +29,12 @@ def drawn_elsewhere(gaussians, camera, backend="auto"):
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    for module in (gpu, step, objective, held_out, initial_colors):
+    for module in (gpu, step, objective, held_out, evidence):
         monkeypatch.setattr(module, "render", drawn_elsewhere)
     plain = torch.optim.Adam
     monkeypatch.setattr(torch.optim, "Adam", lambda *given, fused, **more: plain(*given, **more))
     monkeypatch.setattr(
-        gpu, "avatar_of", lambda count, sizes: avatar_of(count, dataclasses.replace(sizes, **SMALL), False)
+        gpu, "avatar_of", lambda count: avatar_of(count, Architecture(**SMALL), half_precision=False)
     )
 
 
@@ -60,12 +60,11 @@ def test_without_gsplat_it_names_the_command(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_on_a_pretended_device_both_agree_and_all_is_timed(elsewhere, tmp_path, monkeypatch, capsys):
-    write_subject(tmp_path / "subject")
+def test_on_a_pretended_device_both_agree_and_all_is_timed(elsewhere, subject, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gpu, "require_gpu", lambda: DEVICE)
     monkeypatch.setattr(gpu, "fetch_assets", lambda job: None)
     monkeypatch.setattr(
-        gpu, "fitted_mannequin", lambda words, name: mannequin(tmp_path / "subject", tmp_path / name, name)
+        gpu, "fitted_mannequin", lambda words, name: mannequin(subject, tmp_path / name, name)
     )
     monkeypatch.setattr(
         gpu, "trained", lambda job, name: {"subject": "none", "representation": name, "wall s": 1.0}
@@ -87,10 +86,9 @@ def test_on_a_pretended_device_both_agree_and_all_is_timed(elsewhere, tmp_path, 
     assert len(tables["times"]) == 6 and all(row["ms"] > 0 for row in tables["times"])
 
 
-def test_devices_that_differ_are_seen(elsewhere, tmp_path, monkeypatch):
+def test_devices_that_differ_are_seen(elsewhere, subject, tmp_path, monkeypatch):
     """A renderer that is a little off on the other device alone."""
-    write_subject(tmp_path / "subject")
-    data, settings = mannequin(tmp_path / "subject", tmp_path / "out", "bases")
+    data, settings = mannequin(subject, tmp_path / "out", "bases")
 
     def off(gaussians, camera, backend="auto"):
         rendering = drawn_elsewhere(gaussians, camera, backend)
@@ -104,11 +102,3 @@ def test_devices_that_differ_are_seen(elsewhere, tmp_path, monkeypatch):
         row = gpu.compare(data, settings, DEVICE, steps=1)
     assert not row["agree"] and row["picture"] > gpu.LIMITS["picture"]
     assert row["gradients"] > gpu.LIMITS["gradients"]
-
-
-def test_a_bases_avatar_follows_its_poses():
-    avatar = gpu.avatar_in_motion(1000, "bases")
-    assert isinstance(avatar.architecture, Architecture) and len(avatar.representation) == gpu.BASES
-    first, second = step.frames_of(avatar, 2, 16)
-    shown = [avatar.pose(avatar.decode(), one.pose).pose_offset for one in (first, second)]
-    assert float((shown[0] - shown[1]).detach().abs().max()) > 0

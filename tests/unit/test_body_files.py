@@ -15,7 +15,7 @@ from pipeline.body import (
     write_poses,
 )
 from pipeline.errors import UserError
-from tests.unit.fake_body import VERTICES, official_arrays, write_official
+from tests.made.fake_body import VERTICES, official_arrays, write_official
 
 
 def draw(*shape):

@@ -18,7 +18,7 @@ from pipeline.body.landmarks import SIZES, join, landmarks_file
 from pipeline.body.parts import PARTS
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from tests.unit.fake_body import write_official
+from tests.made.fake_body import write_official
 
 FOLDER = REPOSITORY / "data/body"
 
@@ -31,16 +31,6 @@ IBUG = [
 ]  # fmt: skip
 MEDIAPIPE_POSE = [0, 4, 5, 6, 1, 2, 3, *(k + 1 if k % 2 else k - 1 for k in range(7, 33))]
 HANDS = [*range(21, 42), *range(21)]
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(FOLDER / "open_body.npz")
-
-
-@pytest.fixture(scope="module")
-def landmarks(body):
-    return load_landmarks(body, FOLDER)
 
 
 @pytest.fixture(scope="module")

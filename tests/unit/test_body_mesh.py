@@ -5,14 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from pipeline.body import draw_mesh, edges, load_body, rasterize, subdivide, uniform_laplacian, vertex_normals
+from pipeline.body import draw_mesh, edges, rasterize, subdivide, uniform_laplacian, vertex_normals
 from pipeline.clip.camera import facing_camera, project
-from pipeline.config.workspace import REPOSITORY
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data/body/open_body.npz")
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2])

@@ -11,14 +11,9 @@ from scipy.spatial import cKDTree
 from pipeline.body import JOINT_NAMES, load_body
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
-from tests.unit.fake_body import PARENTS, VERTICES, Trap, official_arrays, write_official
+from tests.made.fake_body import PARENTS, VERTICES, Trap, official_arrays, write_official
 
 OPEN_BODY = REPOSITORY / "data/body/open_body.npz"
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(OPEN_BODY)
 
 
 def test_open_body_has_the_schema(body):

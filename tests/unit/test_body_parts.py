@@ -5,14 +5,8 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from pipeline.body import PARTS, is_face, is_part, load_body, part_labels
+from pipeline.body import PARTS, is_face, is_part, part_labels
 from pipeline.body.parts import joint_parts
-from pipeline.config.workspace import REPOSITORY
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(REPOSITORY / "data/body/open_body.npz")
 
 
 def test_every_vertex_has_a_part_and_every_part_has_vertices(body):

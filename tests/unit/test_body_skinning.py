@@ -21,13 +21,7 @@ from pipeline.body import (
     rest_joints,
     rest_vertices,
 )
-from pipeline.config.workspace import REPOSITORY
-from tests.unit.fake_body import write_official
-
-
-@pytest.fixture(scope="module")
-def open_body():
-    return load_body(REPOSITORY / "data/body/open_body.npz")
+from tests.made.fake_body import write_official
 
 
 @pytest.fixture
@@ -64,33 +58,33 @@ def skin_slowly(rotation, joints, parents, weights, points):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_skinning_equals_the_independent_formulation(open_body, seed):
+def test_skinning_equals_the_independent_formulation(body, seed):
     rotation = draw((2, 55, 3), 0.6, seed)
-    joints = rest_joints(open_body, mean_identity(open_body)).double()
-    some = torch.arange(0, len(open_body.v_template), 97)
-    weights, points = open_body.skinning_weights[some].double(), open_body.v_template[some].double()
-    skinned = linear_blend_skinning(joint_transforms(rotation, joints, open_body.parents), weights, points)
+    joints = rest_joints(body, mean_identity(body)).double()
+    some = torch.arange(0, len(body.v_template), 97)
+    weights, points = body.skinning_weights[some].double(), body.v_template[some].double()
+    skinned = linear_blend_skinning(joint_transforms(rotation, joints, body.parents), weights, points)
     for frame in range(2):
-        arguments = (rotation[frame].numpy(), joints.numpy(), open_body.parents)
+        arguments = (rotation[frame].numpy(), joints.numpy(), body.parents)
         np.testing.assert_allclose(
             skinned[frame], skin_slowly(*arguments, weights.numpy(), points.numpy()), atol=1e-12
         )
         world = homogeneous(*arguments)
         np.testing.assert_allclose(
-            posed_joints(rotation, joints, open_body.parents)[frame], world[:, :3, 3], atol=1e-12
+            posed_joints(rotation, joints, body.parents)[frame], world[:, :3, 3], atol=1e-12
         )
         np.testing.assert_allclose(
-            joint_orientations(rotation, open_body.parents)[frame], world[:, :3, :3], atol=1e-12
+            joint_orientations(rotation, body.parents)[frame], world[:, :3, :3], atol=1e-12
         )
 
 
-def test_zero_pose_is_the_template(open_body):
-    expressions = torch.zeros(3, open_body.expression_directions.shape[2])
+def test_zero_pose_is_the_template(body):
+    expressions = torch.zeros(3, body.expression_directions.shape[2])
     vertices, joints = pose_body(
-        open_body, mean_identity(open_body), torch.zeros(3, 55, 3), expressions, torch.zeros(3, 3)
+        body, mean_identity(body), torch.zeros(3, 55, 3), expressions, torch.zeros(3, 3)
     )
-    torch.testing.assert_close(vertices, open_body.v_template.expand(3, -1, -1), atol=1e-6, rtol=0)
-    torch.testing.assert_close(joints[1], open_body.joint_regressor @ open_body.v_template, atol=1e-6, rtol=0)
+    torch.testing.assert_close(vertices, body.v_template.expand(3, -1, -1), atol=1e-6, rtol=0)
+    torch.testing.assert_close(joints[1], body.joint_regressor @ body.v_template, atol=1e-6, rtol=0)
 
 
 def test_global_orientation_turns_the_body_about_its_pelvis(fake):
@@ -105,14 +99,14 @@ def test_global_orientation_turns_the_body_about_its_pelvis(fake):
     torch.testing.assert_close(joints[0, 0], pelvis + transl[0])
 
 
-def test_a_bent_elbow_leaves_the_other_side_alone(open_body):
+def test_a_bent_elbow_leaves_the_other_side_alone(body):
     rotation = torch.zeros(1, 55, 3)
     rotation[0, joint_index("left_elbow"), 1] = -1.5  # forwards
-    joints = rest_joints(open_body, mean_identity(open_body))
-    moved = posed_joints(rotation, joints, open_body.parents)[0]
+    joints = rest_joints(body, mean_identity(body))
+    moved = posed_joints(rotation, joints, body.parents)[0]
     wrist = joint_index("left_wrist")
     assert moved[wrist, 2] > joints[wrist, 2] + 0.2
-    others = [j for j, name in enumerate(open_body.joint_names) if not name.startswith("left_")]
+    others = [j for j, name in enumerate(body.joint_names) if not name.startswith("left_")]
     torch.testing.assert_close(moved[others], joints[others])
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,12 +11,11 @@ from pipeline.avatar import Architecture, Avatar
 from pipeline.avatar import head as heads
 from pipeline.avatar.head import Head
 from pipeline.avatar.skinning_tables import plain_normals, plain_place
-from pipeline.body import Pose, joint_transforms, load_body, mean_identity
+from pipeline.body import Pose, joint_transforms, mean_identity
 from pipeline.device import autocast, moved, product_dtype, resolve
 from pipeline.errors import UserError
+from tests.made.body import open_body
 from tests.pretend_device import DEVICE, Elsewhere, pretend_device
-
-BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
 
 
 def drawn(*shape: int, seed: int = 0) -> Tensor:
@@ -65,7 +63,7 @@ def test_records_move_with_all_that_is_in_them():
 
 @pytest.fixture(scope="module")
 def avatar():
-    body = load_body(BODY_FILE)
+    body = open_body()
     sizes = Architecture(plane_resolution=4, plane_channels=2, width=16, subdivisions=0)
     return Avatar(body, mean_identity(body), torch.arange(len(body.v_template)), sizes)
 

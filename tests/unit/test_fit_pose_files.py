@@ -14,7 +14,7 @@ from pipeline.body import joint_index, posed_joints
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.pose_files import into_camera, into_world, moved_pivot, read_hand_mean, read_smplx_json
-from tests.unit.fake_body import PARENTS, write_official
+from tests.made.fake_body import PARENTS, write_official
 
 FLAT = torch.zeros(30, 3)
 FAST = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -122,9 +122,12 @@ def test_crops_stay_in_the_picture_and_what_was_not_found_has_none():
 
 
 def test_the_paper_is_one_of_the_protocols():
-    assert PROTOCOLS["paper"] == Protocol("white", "truth", "on")
+    assert PROTOCOLS["paper"] == Protocol("white", "truth", "on", "photograph")
     assert chosen({}) == PROTOCOLS["ours"] == Protocol("black", "own", "plan")
     assert chosen({"protocol": "paper", "background": "auto"}) == PROTOCOLS["paper"]
-    assert chosen({"protocol": "paper", "refine_test_poses": "off"}) == Protocol("white", "truth", "off")
+    unrefined = chosen({"protocol": "paper", "refine_test_poses": "off"})
+    assert unrefined == Protocol("white", "truth", "off", "photograph")
     assert set(PROTOCOLS) == set(get_args(ProtocolName))
-    assert set(dataclasses.asdict(PROTOCOLS["ours"])) == {"background", "render_mask", "refine_test_poses"}
+    assert set(dataclasses.asdict(PROTOCOLS["ours"])) == {
+        "background", "render_mask", "refine_test_poses", "edge_colors",
+    }  # fmt: skip

@@ -11,20 +11,19 @@ import torch
 from pipeline.body import (
     JOINT_NAMES,
     joint_index,
-    load_body,
     mean_identity,
     pose_body,
     posed_joints,
     rest_joints,
 )
-from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.pose_files import read_hand_mean
 from stages.animate.motions.motion import Motion, Span, leg_length
 from stages.animate.motions.placement import place
 from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_hands
 from stages.animate.motions.source import motion_source
-from tests.unit.motion_files import (
+from tests.made.body import BODY_FILE
+from tests.made.motions import (
     FPS,
     made_up,
     write_capture,
@@ -33,14 +32,8 @@ from tests.unit.motion_files import (
     write_npz,
 )
 
-BODY_FILE = REPOSITORY / "data" / "body" / "open_body.npz"
 COUNT = 7
 TRUNK = [joint_index(name) for name in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "neck")]
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body(BODY_FILE)
 
 
 @pytest.fixture(scope="module")

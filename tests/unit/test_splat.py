@@ -9,7 +9,7 @@ import torch
 
 from pipeline.clip.camera import Camera, facing_camera, project
 from pipeline.splat import Gaussians, render
-from tests.unit.splat_scene import NAMES, draw, images, leaves, scene
+from tests.made.splat_scene import NAMES, draw, images, leaves, scene
 
 
 def relative_error(value, reference):
@@ -200,7 +200,7 @@ def test_kernels_are_compiled_once_for_all_processes():
     draw(gaussians, camera, "numba")  # compiles, or finds what an earlier process compiled
     program = (
         "import torch\n"
-        "from tests.unit.splat_scene import draw, scene\n"
+        "from tests.made.splat_scene import draw, scene\n"
         "from pipeline.splat import blending, projection, tiles\n"
         "draw(*scene(3, 8, 8, torch.float32), 'numba')\n"
         "kernels = (blending.blend_forward, blending.blend_backward, blending.sum_weights,\n"

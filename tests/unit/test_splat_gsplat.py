@@ -13,7 +13,7 @@ from pipeline.errors import UserError
 from pipeline.splat import Gaussians
 from pipeline.splat.dense import alphas, blending_weights, project_gaussians, render_dense
 from pipeline.splat.gsplat_backend import render_gsplat
-from tests.unit.splat_scene import images, leaves, scene
+from tests.made.splat_scene import images, leaves, scene
 
 
 def rasterization(

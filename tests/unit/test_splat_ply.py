@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from pipeline.splat import Gaussians, render, write_ply
+from tests.made.splat_scene import scene
 from tests.ply_reader import read_ply
-from tests.unit.splat_scene import scene
 
 PROPERTIES = (
     "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()

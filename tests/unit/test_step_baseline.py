@@ -77,6 +77,18 @@ def test_posing_only_what_is_seen_changes_neither_picture_nor_what_it_teaches(pa
     assert image < 1e-5 and gradient < 1e-2
 
 
+def parts_of(row):
+    """The parts that a contestant has: bases have no networks."""
+    networks = {"triplane", "static heads", "pose heads"}
+    return set(step.PARTS) - (networks if row["contestant"] in (step.BASES, step.TWIN) else set())
+
+
+def test_bases_in_one_pass_show_and_learn_what_their_twin_does():
+    one, twin = step.bases_of(COUNT, "cpu")
+    image, gradient = step.bases_difference(one, twin, step.frames_of(one.model, 2, 48))
+    assert image < 1e-6 and gradient < 1e-4
+
+
 def test_a_step_has_a_row_a_contestant_with_every_part(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(step, "avatar_of", lambda count, **kwargs: avatar_of(count, SMALL, **kwargs))
     path = tmp_path / "step.json"
@@ -85,9 +97,10 @@ def test_a_step_has_a_row_a_contestant_with_every_part(monkeypatch, capsys, tmp_
     last = capsys.readouterr().out.splitlines()[-1]
     assert "straightforward takes" in last and "Gaussians at 32²" in last
     rows = json.loads(path.read_text())["rows"]
-    assert [row["contestant"] for row in rows] == [step.OURS, step.ALL, step.OURS_SINGLE, step.PLAIN]
+    names = [step.OURS, step.ALL, step.OURS_SINGLE, step.PLAIN, step.BASES, step.TWIN]
+    assert [row["contestant"] for row in rows] == names
     for row in rows:
-        assert len(row["steps"]) == 2 and all(set(one) == set(step.PARTS) for one in row["steps"])
+        assert len(row["steps"]) == 2 and all(set(one) == parts_of(row) for one in row["steps"])
         assert row["step_ms"] == pytest.approx(min(sum(one.values()) for one in row["steps"]))
 
 
@@ -98,7 +111,7 @@ def test_animation_has_a_row_a_contestant_and_a_headline(monkeypatch, capsys, tm
     assert animate.main(words) == 0
     assert "frames a second" in capsys.readouterr().out.splitlines()[-1]
     rows = json.loads(path.read_text())["rows"]
-    assert len(rows) == 3 and all(len(row["posing"]) == 2 for row in rows)
+    assert len(rows) == 4 and all(len(row["posing"]) == 2 for row in rows)
     for row in rows:
         assert row["asset_mib"] == 14 * 4 * row["gaussians"] / 2**20  # as the paper counts it
 

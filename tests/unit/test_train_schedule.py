@@ -1,5 +1,7 @@
 """What depends on the iteration alone, and the settings that set it."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -42,3 +44,14 @@ def test_draws_need_no_history():
     assert torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 5, 9))
     assert not torch.equal(schedule.drawn_noise(7, 5, 9), schedule.drawn_noise(7, 6, 9))
     assert forward != [schedule.drawn_frame(8, frames, position) for position in range(120)]
+
+
+def test_steps_cost_what_takes_part_in_them():
+    bases = TrainSettings(representation="bases", iterations=10, lpips=0.1, lpips_from=0.5)
+    costs = schedule.step_costs(bases, [1000, 4000])
+    assert len(costs) == 10 and len({*costs[:5]}) == len({*costs[5:]}) == 1 and costs[5] > costs[4]
+    triplane = dataclasses.replace(
+        bases, representation="triplane", lpips=0.0, subdivide_from=0.5, pose_heads_from=0.2
+    )
+    first, _, middle, *_, last = schedule.step_costs(triplane, [1000, 4000])
+    assert first < middle < last

@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from pipeline.avatar import build_canonical
-from pipeline.body import load_body, mean_identity
+from pipeline.body import mean_identity
 from pipeline.clip.camera import facing_camera
 from pipeline.config.settings import Weight
-from pipeline.config.workspace import REPOSITORY
 from stages.train import STAGE, body_regions, losses, objective
 from stages.train.face import Pasted, face_triangles, paste
 from stages.train.losses import person_crop
 from stages.train.settings import TrainSettings
+from tests.made.body import open_body
 
 
 @pytest.fixture(scope="module")
 def canonical():
-    body = load_body(REPOSITORY / "data" / "body" / "open_body.npz")
+    body = open_body()
     return build_canonical(body, mean_identity(body), 0)
 
 

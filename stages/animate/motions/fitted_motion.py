@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ import roma
 
 from pipeline.body import JOINT_NAMES, BodyModel, read_identity, read_poses, rest_joints
 from pipeline.clip.camera import facing_camera
-from pipeline.clip.records import read_cameras, read_footage
+from pipeline.clip.records import Footage, read_cameras, read_footage
 from pipeline.errors import UserError
 from stages.animate.motions.motion import USUAL_FPS, Motion, Span, leg_length
 
@@ -35,7 +36,7 @@ def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: S
     camera = read_cameras(folders["ingest"] / "cameras.parquet").get(poses.frames[0])
     if camera is None:
         raise UserError(f"{folders['ingest']}: frame {poses.frames[0]} has no camera: doit run ingest:{name}")
-    own_fps = _rate(read_footage(folders["ingest"] / "footage.json").seconds)
+    own_fps = _rate(read_footage(folders["ingest"] / "footage.json"))
     rows, fps = span.rows(len(poses), own_fps or USUAL_FPS, f"subject {name}")
     turn = facing_camera(1, 1, 1.0).rotation.mT @ camera.rotation
     rotation = poses.rotation[rows].clone()
@@ -55,7 +56,9 @@ def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: S
     )
 
 
-def _rate(seconds: tuple[float, ...]) -> float | None:
-    """Kept frames a second; None where the clip has no clock."""
-    steps = [b - a for a, b in zip(seconds[:-1], seconds[1:], strict=True) if b > a]
+def _rate(footage: Footage) -> float | None:
+    """Kept frames a second; None where the clip has no clock, whose seconds are places in a folder."""
+    if not footage.fps > 0:
+        return None
+    steps = [b - a for a, b in itertools.pairwise(footage.seconds) if b > a]
     return 1 / statistics.median(steps) if steps else None

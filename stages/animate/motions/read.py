@@ -11,8 +11,9 @@ import torch
 
 from pipeline.body import JOINT_NAMES, BodyModel, Identity, rest_joints
 from pipeline.clip.frames import spread_end_to_end
+from pipeline.config.choices import Up
 from pipeline.motion.bvh import read_bvh
-from pipeline.motion.retarget import match_joints, retarget_rows
+from pipeline.motion.retarget import retarget_rows
 from stages.animate.motions.amass import read_amass
 from stages.animate.motions.fitted_motion import read_fitted
 from stages.animate.motions.motion import Motion, Span, leg_length
@@ -38,7 +39,7 @@ class DrivenPerson:
 
 
 def read_motion(
-    name: MotionSource, person: DrivenPerson, span: Span, up: str, folders: Mapping[str, Path]
+    name: MotionSource, person: DrivenPerson, span: Span, up: Up, folders: Mapping[str, Path]
 ) -> Motion:
     """Reads a motion; not a turntable, which is none.
 
@@ -46,7 +47,7 @@ def read_motion(
         name: what it is.
         person: who is to be moved by it.
         span: which frames are wanted.
-        up: the axis that is up in an .npz: y, z or auto.
+        up: the axis that is up in a .bvh or an .npz, or auto.
         folders: the other subject's results, if it is one.
 
     Raises:
@@ -56,36 +57,34 @@ def read_motion(
         return read_fitted(name.subject, folders, person.body, span)
     assert name.path is not None
     if name.kind == "bvh":
-        return read_capture(name.path, person, span)
+        return read_capture(name.path, person, span, up)
     if name.kind == "amass":
         return read_amass(name.path, person.body, span, up)
     return read_pose_folder(name.path, person.body, person.body_file, span)
 
 
-def read_capture(path: Path, person: DrivenPerson, span: Span) -> Motion:
+def read_capture(path: Path, person: DrivenPerson, span: Span, up: Up = "auto") -> Motion:
     """Reads a BVH file and carries it over, see ``retarget``.
 
     Raises:
         UserError: it is no BVH, its joints are not known by name, or no frame is in the span.
     """
     bvh = read_bvh(path)
-    columns = match_joints(bvh.names, str(path))
     rows, fps = span.rows(len(bvh.values), bvh.fps, path.name)
-    count = len(bvh.values)
-    reference = np.array(spread_end_to_end(range(count), _REFERENCE_FRAMES), np.int64)
+    reference = np.array(spread_end_to_end(range(len(bvh.values)), _REFERENCE_FRAMES), np.int64)
     joints = rest_joints(person.body, person.identity)
-    rotation, root = retarget_rows(bvh, joints, person.body.parents, rows, reference)
-    used = set(columns.values())
+    carried = retarget_rows(bvh, joints, person.body.parents, rows, reference, up, str(path))
     return Motion(
         name=path.name,
         fps=fps,
         numbers=tuple(rows.tolist()),
-        rotation=rotation,
+        rotation=carried.rotation,
         expression=None,
-        root=root,
+        root=carried.root,
         leg=leg_length(person.body, identity=person.identity),
-        told=tuple(joint for joint in JOINT_NAMES if joint in columns),
-        unused=tuple(joint for place, joint in enumerate(bvh.names) if place not in used),
+        told=carried.told,
+        unused=carried.unused,
+        notes=(f"{path.name}: {carried.note}",),
     )
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import stat
 from pathlib import Path
 
 from pipeline.errors import UserError
 
 TURNTABLE = "turntable"
 SUBJECT = "subject:"
+_SHOWN = 200  # characters of a word in a message
 KINDS = {".bvh": "bvh", ".npz": "amass"}
 REMEDY = (
     "a motion is a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, subject:NAME (what another "
@@ -49,14 +52,32 @@ def motion_source(text: str) -> MotionSource:
     if text.startswith(SUBJECT) and len(text) > len(SUBJECT):
         return MotionSource("subject", subject=text.removeprefix(SUBJECT))
     path = Path(text)
-    if not text or not path.exists():
-        raise UserError(f"motion={text}: there is no such file; {REMEDY}")
-    if path.is_dir():
-        return MotionSource("peers", path)
+    try:
+        mode = path.stat().st_mode if text else 0
+    except (OSError, ValueError):  # a name may also be too long, or hold what no name does
+        mode = 0
+    shown = text if len(text) < _SHOWN else f"{text[:_SHOWN]}..."
+    if not mode:
+        raise UserError(f"motion={shown}: there is no such file; {REMEDY}")
+    if stat.S_ISDIR(mode):
+        return _folder(path)
+    if not stat.S_ISREG(mode):
+        raise UserError(f"motion={text}: it is neither a file nor a folder; {REMEDY}")
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise UserError(f"motion={text}: a {path.suffix or 'file without a suffix'} is no motion; {REMEDY}")
     return MotionSource(kind, path)
+
+
+def _folder(path: Path) -> MotionSource:
+    """A folder of poses; UserError where nothing in it can be one."""
+    try:
+        names = os.listdir(path)
+    except OSError as error:
+        raise UserError(f"motion={path}: cannot be listed ({error.strerror}); {REMEDY}") from None
+    if not any(name.removesuffix(".json").isdigit() for name in names if name.endswith(".json")):
+        raise UserError(f"motion={path}: has {len(names)} files, none usable as <frame>.json; {REMEDY}")
+    return MotionSource("peers", path)
 
 
 def named_subject(text: str) -> str:

@@ -91,7 +91,7 @@ def denoise(
         scaled = scheduler.scale_model_input(latents, timestep)
         total, weight = torch.zeros_like(latents, dtype=torch.float32), torch.zeros(len(poses), device=device)
         for tile in order:
-            answer = _guided(
+            answer = guided_noise(
                 model, scaled[tile], timestep, embedding, image, times, drawn[tile], sampling.guidance
             )
             share = tile_weights(len(tile)).to(device)
@@ -103,7 +103,7 @@ def denoise(
     return latents
 
 
-def _guided(
+def guided_noise(
     model: Model,
     noisy: Tensor,  # [F, 4, h, w]
     timestep: Tensor,

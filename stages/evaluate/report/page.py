@@ -18,6 +18,7 @@ from stages.evaluate.report import tables
 from stages.evaluate.report.omissions import Omission
 from stages.evaluate.report.pictures import Closeup, Comparison
 from stages.evaluate.scores import HELD_OUT
+from stages.evaluate.turned import Turned
 from stages.evaluate.upstream import StageRecord
 
 LARGEST_VIDEO = 24 * 2**20
@@ -51,6 +52,7 @@ class ReportContents:
         omissions: what was left out.
         stages: upstream first.
         versions: what made the result, name -> version.
+        turned: the avatar from all sides, where it was looked at.
     """
 
     summary: Mapping[str, Any]
@@ -72,6 +74,7 @@ class ReportContents:
     omissions: Sequence[Omission]
     stages: Sequence[StageRecord]
     versions: Mapping[str, str]
+    turned: Turned | None = None
 
 
 def write_report(path: Path, contents: ReportContents) -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 
 _REMEDY = "give the folder that holds flame_params/ and shape_param.json as fit.face_init"
 
@@ -78,7 +79,7 @@ def _frame(path: Path) -> tuple[np.ndarray, np.ndarray] | tuple[()] | None:
 
 def _json(path: Path) -> object:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(decode_text(path.read_bytes()))
     except FileNotFoundError:
         raise UserError(f"{path} is missing: {_REMEDY}") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 
 from pipeline.errors import UserError
+from pipeline.files.text_encoding import decode_text
 from pipeline.untrusted import bounded_bytes
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
 
@@ -52,7 +53,7 @@ def _read_cameras(path: Path) -> dict[str, Any]:
             return {
                 one.get("serial", ""): one for one in ElementTree.fromstring(content).findall(".//camera")
             }
-        tables = tomllib.loads(content.decode("utf-8"))
+        tables = tomllib.loads(decode_text(content))
     except (tomllib.TOMLDecodeError, ElementTree.ParseError, ValueError) as error:
         kind = "Pose2Sim" if path.suffix == ".toml" else "Qualisys"
         raise UserError(f"{path} is no {kind} calibration ({error}): export it again") from None

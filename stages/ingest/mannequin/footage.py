@@ -15,6 +15,7 @@ from pipeline.clip.camera import Camera, project
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints, write_keypoints
 from pipeline.clip.records import Footage, write_cameras, write_footage, write_split
+from stages.ingest.foreground import write_foreground
 from stages.ingest.mannequin.appearance import make_appearance
 from stages.ingest.mannequin.attire import surface_offset
 from stages.ingest.mannequin.framing import frame_motion, unseen_camera
@@ -50,6 +51,7 @@ class Filming:
         spec: what is filmed.
         scene: bodies and cameras.
         places: the places of joints and landmarks.
+        notes: what a user should know of the motion's file, a sentence each.
         point_states: [T, K] uint8, their states, known once all the pictures have been taken.
     """
 
@@ -68,7 +70,7 @@ class Filming:
             spec, rest_joints(body, identity), body.parents, body.expression_directions.shape[2]
         )
         shot = frame_motion(spec, body, clothed, motion)
-        self.identity = identity
+        self.identity, self.notes = identity, motion.notes
         self.scene = make_scene(body, clothed, appearance, shot, spec.seed)
         self.places: BodyPoints = pose_points(body, landmarks, identity, shot.poses)
         self.point_states = np.zeros(self.places.world.shape[:2], np.uint8)
@@ -148,6 +150,7 @@ def run_mannequin(context: Context) -> None:
     keypoints, truth = filming.finish()
     context.timing("film_seconds", round(time.perf_counter() - started, 2))
 
+    write_foreground(output, frames)
     write_cameras(output / "cameras.parquet", dict.fromkeys(frames, filming.scene.shot.camera))
     write_keypoints(output / "keypoints.parquet", keypoints)
     write_split(output / "split.json", split)
@@ -159,7 +162,10 @@ def run_mannequin(context: Context) -> None:
         for row, camera, picture in film_view(spec, filming.scene, name):
             _write(output / "views" / name, row, picture)
             cameras[row] = camera
+        write_foreground(output / "views" / name, sorted(cameras), learn=False)
         write_cameras(output / "views" / name / "cameras.parquet", cameras)
+    for note in filming.notes:
+        context.log(note)
     context.log(
         f"{spec.frames} frames of a mannequin, {spec.framing} framing, {len(split.test)} of them held out"
     )

@@ -31,11 +31,13 @@ class MannequinMotion:
         rotation: [T, 55, 3], rotation vectors relative to the parent joint.
         expression: [T, E].
         root: [T, 3], metres, where the pelvis is relative to where it begins; the body faces +Z.
+        notes: what a user should know of the capture that was read, a sentence each.
     """
 
     rotation: Tensor
     expression: Tensor
     root: Tensor
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass
@@ -94,10 +96,13 @@ def make_motion(
         return MannequinMotion(
             _composed(draft.turns), torch.from_numpy(draft.expression).float(), torch.zeros(spec.frames, 3)
         )
-    rotation, root = retarget(read_bvh(Path(spec.motion)), joints, parents, spec.frames, spec.fps)
+    capture = read_bvh(Path(spec.motion))
+    carried = retarget(capture, joints, parents, spec.frames, spec.fps, origin=spec.motion)
+    rotation = carried.rotation.clone()
     face = [joint_index(name) for name in ("jaw", "left_eye", "right_eye")]
     rotation[:, face] = _composed(draft.turns)[:, face]
-    return MannequinMotion(rotation, torch.from_numpy(draft.expression).float(), root)
+    expression = torch.from_numpy(draft.expression).float()
+    return MannequinMotion(rotation, expression, carried.root, (f"{spec.motion}: {carried.note}",))
 
 
 def _composed(turns: np.ndarray) -> Tensor:

@@ -11,8 +11,8 @@ import av
 import cv2
 import numpy as np
 
-from pipeline.run.stage import Context
 from stages.ingest.settings import IngestSettings
+from tests.made.context import RecordedContext, stage_context
 
 
 def numbered_images(count: int, height: int = 48, width: int = 64) -> list[np.ndarray]:
@@ -97,22 +97,10 @@ def write_points(folder: Path, numbers: Sequence[int], score: float = 0.9, name:
     return folder
 
 
-def make_context(
+def ingest_context(
     folder: Path, source: Path | None, assets: dict[str, Path] | None = None, **settings: object
-) -> Context:
-    """A context with empty scratch folders under ``folder``."""
+) -> RecordedContext:
+    """The ingest stage's context with empty scratch folders under ``folder``."""
+    wanted = IngestSettings(**settings)  # type: ignore[arg-type]
     output, work = folder / "output", folder / "work"
-    output.mkdir(parents=True)
-    work.mkdir()
-    return Context(
-        subject="someone",
-        settings=IngestSettings(**settings),  # type: ignore[arg-type]
-        inputs={},
-        assets=assets or {},
-        source=source,
-        body=folder,
-        body_file=folder,
-        output=output,
-        work=work,
-        stage="ingest",
-    )
+    return stage_context("ingest", wanted, output, work=work, assets=assets or {}, source=source)

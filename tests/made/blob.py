@@ -1,22 +1,18 @@
 """A tiny subject for the evaluate stage: a blob of Gaussians, filmed by the renderer itself."""
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from pipeline.body import Poses, load_body, mean_identity, write_identity, write_poses
+from pipeline.body import Poses, mean_identity, write_poses
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.curves import Curve
-from pipeline.clip.frames import write_frame, write_mask
-from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints, write_keypoints
-from pipeline.clip.plan import write_plan
-from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
+from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints
+from pipeline.clip.records import Footage, Split
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import write_table
-from pipeline.run.stage import Context
 from pipeline.splat import Gaussians, render
 from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.frame_metrics import Scorer
@@ -24,16 +20,16 @@ from stages.evaluate.run import evaluate
 from stages.evaluate.settings import EvaluateSettings
 from stages.fit.run import RESIDUALS_SCHEMA as RESIDUALS
 from stages.train.visibility_gate import write_visibility
-from tests.plans import plan_of
+from tests.made.body import open_body
+from tests.made.context import RecordedContext, stage_context
+from tests.made.plans import plan_of
+from tests.made.published import publish
 
 FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
 TEST = FRAMES[-3:]
 WIDTH, HEIGHT = 64, 48
-BODY_FILE = Path(__file__).parents[2] / "data" / "body" / "open_body.npz"
 
 OPTIONAL = ("mesh", "second", "embedder", "other_cameras")
-
-body = functools.cache(functools.partial(load_body, BODY_FILE))
 
 
 def stand_in(pose, time):
@@ -69,29 +65,16 @@ def moving_poses(shift=0.0):
 class FilmedBlob:
     """A subject as the upstream stages publish it, filmed of the stand-in avatar."""
 
-    root: object
-    inputs: dict
+    root: Path
+    inputs: dict[str, Path]
 
-    def context(self, name="out", **settings):
-        output, work = self.root / name, self.root / f"{name}-work"
-        output.mkdir()
+    def context(self, name="out", **settings) -> RecordedContext:
         small = {"turntable_frames": 4, "turntable_width": 48, "turntable_height": 64, "motion_frames": 4}
-        settings = {**small, **settings}
-        return Context(
-            subject="blob",
-            settings=EvaluateSettings(lpips_networks=(), **settings),
-            inputs=self.inputs,
-            assets={},
-            source=None,
-            body=self.root,
-            body_file=self.root / "body.npz",
-            output=output,
-            work=work,
-            stage="evaluate",
-        )
+        settings = EvaluateSettings(lpips_networks=(), **{**small, **settings})
+        return stage_context("evaluate", settings, self.root / name, self.inputs, subject="blob")
 
     def clip(self):
-        return read_evaluated_clip(self.inputs, body())
+        return read_evaluated_clip(self.inputs, open_body())
 
     def evaluate(self, animate=stand_in, name="out", follow=None, **arguments):
         """``arguments``: those of ``evaluate`` by their names; all others are settings."""
@@ -114,29 +97,33 @@ def a_face_and_a_hand():
     return keypoints
 
 
-def make_clip(root, test=TEST, soft=False):
-    """``soft``: masks are the alpha, and frames show the blob's colour undimmed. Else hard masks."""
-    inputs = {name: root / name for name in ("ingest", "fit", "plan", "train")}
-    for folder in (*inputs.values(), inputs["ingest"] / "frames", inputs["ingest"] / "masks"):
-        folder.mkdir()
-    ingest, fit, plan, train = inputs.values()
+def filmed(soft: bool):
+    """Frame and mask of each pose, [H, W, 3] and [H, W] uint8; ``soft`` as of ``make_clip``."""
     camera, poses = facing_camera(WIDTH, HEIGHT, 70.0), moving_poses()
     for frame in FRAMES:
         rendering = render(stand_in(poses.pose(frame), None), camera)
         alpha = rendering.alpha if soft else (rendering.alpha > 0).float()
         color = rendering.color / rendering.alpha[..., None].clamp(min=1e-6) if soft else rendering.color
-        write_frame(ingest / "frames", frame, (color.clamp(0, 1) * 255).round().byte().numpy())
-        write_mask(ingest / "masks", frame, (alpha * 255).round().byte().numpy())
-    write_keypoints(ingest / "keypoints.parquet", a_face_and_a_hand())
-    write_cameras(ingest / "cameras.parquet", dict.fromkeys(FRAMES, camera))
-    write_split(ingest / "split.json", Split(tuple(f for f in FRAMES if f not in test), test))
+        yield (color.clamp(0, 1) * 255).round().byte().numpy(), (alpha * 255).round().byte().numpy()
+
+
+def make_clip(root: Path, test=TEST, soft: bool = False) -> FilmedBlob:
+    """``soft``: masks are the alpha, and frames show the blob's colour undimmed. Else hard masks."""
     dropped = {"no person was found": 2, "unreadable": 0}
     seconds = tuple(frame / 25 for frame in FRAMES)
-    footage = Footage("blob.mp4", 128, 96, 25.0, 0.5, 14, 12, dropped, 2, seconds, {"masks": "made"})
-    write_footage(ingest / "footage.json", footage)
-    write_identity(fit / "identity.safetensors", mean_identity(body()), body())
-    write_poses(fit / "poses.parquet", poses)
-    write_poses(train / "poses.parquet", poses)
+    inputs = publish(
+        root,
+        filmed(soft),
+        dict.fromkeys(FRAMES, facing_camera(WIDTH, HEIGHT, 70.0)),
+        (open_body(), mean_identity(open_body()), moving_poses()),
+        Footage("blob.mp4", 128, 96, 25.0, 0.5, 14, 12, dropped, 2, seconds, {"masks": "made"}),
+        Split(tuple(frame for frame in FRAMES if frame not in test), test),
+        a_face_and_a_hand(),
+        plan_of(pose_heads=False, test_time_refinement=False),
+    )
+    fit, train = inputs["fit"], root / "train"
+    train.mkdir()
+    write_poses(train / "poses.parquet", moving_poses())
     errors = {"frame": np.array(FRAMES[:2], np.int32), "group": np.array(["body", "face"], dtype=object)}
     pixels = {"point": np.zeros(2, np.int32), "pixels": np.array([1.0, 3.0], np.float32)}
     write_table(fit / "residuals.parquet", RESIDUALS, errors | pixels)
@@ -152,5 +139,4 @@ def make_clip(root, test=TEST, soft=False):
         train / "visibility.parquet", captured=kept * 1.0, generated=kept * 0.0, early=~kept, kept=kept
     )
     write_json(train / "gate.json", {"tau": 0.5, "why": "20% of the body is under 0.50", "definition": "x"})
-    write_plan(plan / "plan.json", plan_of(pose_heads=False, test_time_refinement=False))
-    return FilmedBlob(root, inputs)
+    return FilmedBlob(root, {**inputs, "train": train})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,8 +12,6 @@ from pipeline.body import (
     Landmarks,
     Poses,
     joint_index,
-    load_body,
-    load_landmarks,
     locate,
     mean_identity,
     pose_body,
@@ -28,9 +25,8 @@ from stages.fit.observations import observe
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
 from stages.fit.registration import frozen_groups, views_of
 from stages.fit.settings import FitSettings
+from tests.made.body import open_body, open_landmarks
 
-BODY_FOLDER = Path(__file__).parents[2] / "data" / "body"
-BODY_FILE = BODY_FOLDER / "open_body.npz"
 SIZE = 256
 QUICK = FitSettings(iterations=100)
 
@@ -45,9 +41,9 @@ class DetectedClip:
     joints: torch.Tensor
 
 
-def load():
-    body = load_body(BODY_FILE)
-    return body, load_landmarks(body, BODY_FOLDER)
+def load() -> tuple[BodyModel, Landmarks]:
+    """The open body and its landmarks."""
+    return open_body(), open_landmarks()
 
 
 def true_poses(frames: tuple[int, ...], distance: float = 3.0) -> Poses:

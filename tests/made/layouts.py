@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.stages.ingest_clips import write_clip
-from tests.stages.layout_footage import SIZE, Footage, Take
+from tests.made.body import BODY_FILE
+from tests.made.layout_footage import SIZE, Footage, Take
+from tests.made.videos import write_clip
 
 SMPL_ROOT = np.array([-0.00179505, -0.22333345, 0.02821918])  # SMPL's neutral mean: published, in metres
 SMPLX_ROOT = np.array([0.0031, -0.3514, 0.0120])
@@ -60,8 +61,6 @@ def local(shown: Footage, row: int) -> np.ndarray:
 
 
 def hand_mean(shown: Footage) -> np.ndarray:
-    from tests.stages.fit_clip import BODY_FILE
-
     with np.load(BODY_FILE) as archive:
         return np.concatenate([archive["hands_meanl"].reshape(15, 3), archive["hands_meanr"].reshape(15, 3)])
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from pipeline.body import BodyModel, Identity, Poses, load_body, load_landmarks, pose_body, rest_joints
+from pipeline.body import BodyModel, Identity, Poses, pose_body, rest_joints
 from pipeline.clip.camera import Camera
 from stages.ingest.mannequin.footage import Filming
 from stages.ingest.mannequin.scene import film, make_background
 from stages.ingest.mannequin.spec import MannequinSpec
-from tests.stages.fit_clip import BODY_FILE, BODY_FOLDER
+from tests.made.body import open_body, open_landmarks
 
 SIZE, COUNT, FEW = 112, 6, 3
 
@@ -79,11 +79,11 @@ class Footage:
 @functools.cache
 def footage() -> Footage:
     """Film it; all tests share what comes out."""
-    body = load_body(BODY_FILE)
+    body = open_body()
     spec = MannequinSpec(
         "full", motion="turn+gesture+curl+speech", frames=COUNT, size=SIZE, fps=8.0, noise=0.0
     )
-    filming = Filming(spec, body, load_landmarks(body, BODY_FOLDER))
+    filming = Filming(spec, body, open_landmarks())
     points = filming.places.world[:, filming.places.sets["whole_body"]].double().numpy()
     first = filming.scene.shot.camera
     poses = filming.scene.shot.poses

@@ -8,18 +8,19 @@ from pathlib import Path
 import torch
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
-from pipeline.body import load_body, mean_identity
-from pipeline.run.stage import Context
+from pipeline.body import mean_identity
 from stages.animate.run import run
 from stages.animate.settings import AnimateSettings
-from tests.stages.train_subject import BODY_FILE, write_subject
+from tests.made.body import open_body
+from tests.made.context import RecordedContext, stage_context
+from tests.made.portrait import write_subject
 
 SMALL = {"width": 48, "height": 64, "turntable_frames": 4, "turntable_fps": 8.0}
 
 
 def awake_avatar(gated: bool = False) -> Avatar:
     """An avatar whose every head has a say; ``gated``: nothing below the waist was ever seen."""
-    body = load_body(BODY_FILE)
+    body = open_body()
     sizes = Architecture(
         plane_resolution=8, plane_channels=4, width=16, groups=4, residual_width=16, subdivisions=0,
         residual_parts=("face",),
@@ -41,21 +42,11 @@ class Studio:
 
     root: Path
 
-    def animate(self, name: str = "out", loans=None, **settings) -> Context:
-        output = self.root / name
-        output.mkdir()
-        context = Context(
-            subject="doll",
-            settings=AnimateSettings(**{**SMALL, **settings}),
-            inputs={stage: self.root / stage for stage in ("ingest", "fit", "train")},
-            assets={},
-            source=None,
-            body=BODY_FILE.parent,
-            body_file=BODY_FILE,
-            output=output,
-            work=self.root / f"{name}-work",
-            stage="animate",
-            loans=loans or {},
+    def animate(self, name: str = "out", loans=None, **settings) -> RecordedContext:
+        settings = AnimateSettings(**{**SMALL, **settings})
+        inputs = {stage: self.root / stage for stage in ("ingest", "fit", "train")}
+        context = stage_context(
+            "animate", settings, self.root / name, inputs, subject="doll", loans=loans or {}
         )
         run(context)
         return context

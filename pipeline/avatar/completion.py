@@ -1,0 +1,82 @@
+"""Completion of a trained avatar: what no frame showed well is taken from what frames did.
+
+After training each Gaussian keeps what was learnt as far as evidence trusts it (``evidence.py``), and has for
+the rest colour and scale from its own segment of the body (``pipeline/texture/completion.py``); what
+follows the pose fades out likewise. Seconds of work, no generator, and an avatar of which everything was
+seen stays as it was to the byte.
+
+The bases' representation takes the values as its own. The triplane cannot: its values are read from planes
+that other Gaussians read, too. So its avatar stores them beside the planes (``Avatar.completion``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar.avatar import Avatar
+from pipeline.avatar.evidence import Evidence
+from pipeline.avatar.representation import Decoded
+from pipeline.avatar.surface import Surface
+from pipeline.texture.completion import complete_colors, complete_log_scales
+from pipeline.texture.segments import Segments, find_segments
+
+DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
+
+
+def surface_segments(surface: Surface) -> Segments:
+    """The segments of an avatar's surface."""
+    mesh = surface.canonical
+    return find_segments(mesh.vertices, mesh.faces, mesh.skinning_weights, mesh.parts, mesh.joints)
+
+
+def complete_color_logits(surface: Surface, evidence: Evidence) -> Tensor:
+    """Logits of the colours that frames showed, completed where they showed none: [N, 3]."""
+    color, trust, normals = (
+        one.detach().double().cpu().numpy() for one in (evidence.color, evidence.trust, evidence.normals)
+    )
+    found = torch.from_numpy(complete_colors(surface_segments(surface), color, trust, normals))
+    return torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(evidence.color)
+
+
+@torch.no_grad()
+def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
+    """Completes an avatar in place; to be called once, after training.
+
+    Args:
+        avatar: trained.
+        evidence: of its ungated Gaussians, N.
+    """
+    decoded = avatar.decode()
+    rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
+    trust = evidence.together
+    avatar.trust.index_copy_(0, rows, trust.to(avatar.trust))
+    if bool((trust == 1).all()):
+        return
+    avatar.take_completion(rows, completed_values(decoded, evidence))
+
+
+def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
+    """What was decoded with colour and scale completed.
+
+    Offsets stay: what no frame shows must keep behind the silhouettes that frames do show, and training has
+    put it there.
+    """
+    segments = surface_segments(decoded.surface)
+    color, log_scale, trust, shape_trust, normals = (
+        one.detach().double().cpu().numpy()
+        for one in (
+            torch.sigmoid(decoded.color_logit), decoded.log_scale, evidence.trust,
+            evidence.shape_trust, evidence.normals,
+        )
+    )  # fmt: skip
+    like = decoded.offset
+    found = torch.from_numpy(complete_colors(segments, color, trust, normals))
+    logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
+    return dataclasses.replace(
+        decoded,
+        color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
+        log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, shape_trust)).to(like),
+    )

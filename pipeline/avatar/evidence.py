@@ -1,0 +1,168 @@
+"""Evidence: how much of each Gaussian how many frames really showed, and how squarely.
+
+The paper's visibility score counts a vertex that lies in the picture, hidden or turned away or not. That is
+right for the gate, and wrong for every question about colours and places: a back that faces away for the
+whole clip is in every picture. Here a frame counts for a Gaussian by
+
+- its *share*: the blending weight that the Gaussian has in the person's own pixels, against the pixels that
+  its piece of the surface would cover if nothing stood before it. The share does not depend on the picture's
+  resolution, nor on how finely the mesh is divided there;
+- its *squareness*: the cosine between the surface's normal and the view. Under ``GRAZING`` a frame says
+  nothing, because a fit that is a little off shows the wall there.
+
+What looks at evidence asks for ``trust``, which is continuous.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from pipeline.avatar.surface import Surface
+from pipeline.body.mesh import face_normals, vertex_normals
+from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.views import View
+from pipeline.splat import Gaussians, render
+
+GRAZING, SQUARE = 0.0, 0.2  # cosines: nothing is learnt, all is learnt
+PERSON = 0.2, 0.7  # alpha: a pixel does not count, counts wholly
+LEAST_TRUST = 0.5  # from which a pixel of a generated frame counts
+HIDDEN, OPEN = 0.15, 0.4  # shares: what shines through from behind, what is plainly seen
+DOUBTED, TRUSTED = 0.01, 0.12  # mean over the frames: of a few frames in hundreds, and of one in eight
+EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
+SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """The evidence that some frames give of each of N Gaussians.
+
+    Attributes:
+        seen: [N] in [0, 1], mean over the frames of share and squareness together.
+        frames: [N] in [0, 1], the part of the frames that showed it at all: the mean share.
+        facing: [N] in [0, 1], the mean cosine in the frames that showed it; 0 where none did.
+        color: [N, 3], its mean colour in them, RGB in [0, 1]; meaningless where ``seen`` is 0.
+        normals: [N, 3], its mean normal in the world over all the frames; short where the body turned.
+    """
+
+    seen: Tensor  # [N]
+    frames: Tensor  # [N]
+    facing: Tensor  # [N]
+    color: Tensor  # [N, 3]
+    normals: Tensor  # [N, 3]
+
+    @property
+    def trust(self) -> Tensor:
+        """How far the colour that was learnt of each Gaussian is to be believed, [N] in [0, 1]."""
+        return ramp(self.seen, DOUBTED, TRUSTED)
+
+    @property
+    def shape_trust(self) -> Tensor:
+        """How far its place and size are, [N] in [0, 1]: also what a silhouette showed from its edge."""
+        return ramp(self.frames, DOUBTED, TRUSTED)
+
+    @property
+    def together(self) -> Tensor:
+        """Trust of colour and of shape, [N, 2], as ``Avatar.trust`` has it."""
+        return torch.stack([self.trust, self.shape_trust], 1)
+
+    def filled(self, other: Evidence) -> Evidence:
+        """This evidence, and where it is weak the other's, as of generated frames beside captured ones."""
+        share = self.trust[:, None]
+        return Evidence(
+            seen=torch.maximum(self.seen, other.seen),
+            frames=torch.maximum(self.frames, other.frames),
+            facing=torch.maximum(self.facing, other.facing),
+            color=share * self.color + (1 - share) * other.color,
+            normals=self.normals,
+        )
+
+
+def ramp(values: Tensor, low: float, high: float) -> Tensor:
+    """0 up to ``low``, 1 from ``high`` on, a smooth step between (``3 x^2 - 2 x^3``)."""
+    place = ((values - low) / (high - low)).clamp(0, 1)
+    return place.square() * (3 - 2 * place)
+
+
+def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -> Evidence:
+    """The evidence that frames give of a surface's Gaussians.
+
+    Args:
+        shown: for each frame the avatar in its pose, N Gaussians, and the frame, on the avatar's device.
+        surface: that carries the Gaussians.
+
+    Raises:
+        ValueError: there is no frame.
+    """
+    faces, count = surface.canonical.faces, 0
+    sums: list[Tensor] = []
+    for gaussians, view in shown:
+        found = frame_evidence(gaussians, view, faces)
+        sums = [total + one for total, one in zip(sums, found, strict=True)] if sums else list(found)
+        count += 1
+    if not sums:
+        raise ValueError("evidence needs at least one frame")
+    seen, frames, facing, color, normals = sums
+    return Evidence(
+        seen=seen / count,
+        frames=frames / count,
+        facing=facing / frames.clamp_min(1e-12),
+        color=color / seen.clamp_min(1e-12)[:, None],
+        normals=normals / count,
+    )
+
+
+def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Tensor, ...]:
+    """One frame's part in the sums of ``Evidence``: three of [N], colour times seen and normals, [N, 3].
+
+    The blending weights come from the renderer's own backward pass: the derivative of
+    ``sum(rendering * picture)`` with respect to a Gaussian's colour is the sum of the pixels that it covers,
+    each times its blending weight there.
+    """
+    means = gaussians.means.detach()
+    normals = vertex_normals(means, faces)
+    covered = covered_pixels(view.camera, means, faces)
+    towards = torch.nn.functional.normalize(view.camera.centre.to(means) - means, dim=1)
+    cosine = (normals * towards).sum(1).clamp(0, 1)
+    weighed = dataclasses.replace(gaussians, colors=gaussians.colors.detach().clone().requires_grad_())
+    image = render(weighed, view.camera).color
+    counts = ramp(view.alpha, *PERSON)[..., None]
+    if view.trust is not None:
+        counts = counts * (view.trust >= LEAST_TRUST)[..., None]
+    color = torch.autograd.grad((image * view.color * counts).sum(), weighed.colors, retain_graph=True)[0]
+    weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, 0]
+    share = weight / covered.clamp_min(SMALLEST)
+    showed = ramp(share, HIDDEN, OPEN)
+    seen = showed * ramp(cosine, GRAZING, SQUARE)
+    return seen, showed, showed * cosine, color / weight.clamp_min(1e-12)[:, None] * seen[:, None], normals
+
+
+def covered_pixels(
+    camera: Camera,
+    points: Tensor,  # [N, 3]
+    faces: Tensor,  # [F, 3]
+) -> Tensor:
+    """The pixels that each point's piece of the surface covers, [N], if nothing stands before it.
+
+    A point's piece is a third of each triangle around it, whichever way it faces. A piece that is seen from
+    its edge covers a little, too: Gaussians are not flat.
+
+    Args:
+        camera: that looks.
+        points: posed, metres.
+        faces: int64.
+    """
+    pixels, depth = project(camera, points), to_camera(camera, points)[:, 2]
+    a, b, c = (pixels[faces[:, corner]] for corner in range(3))
+    ab, ac = b - a, c - a
+    area = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / 2
+    scale = (camera.intrinsics[0, 0] / depth[faces].mean(1).clamp_min(1e-2)) ** 2
+    area = torch.maximum(area, EDGE_ON * scale * face_normals(points, faces).norm(dim=1) / 2)
+    area = torch.where((depth[faces] > 0).all(1), area, torch.zeros_like(area))
+    pieces = torch.zeros_like(depth)
+    for corner in range(3):
+        pieces.index_add_(0, faces[:, corner], area / 3)
+    return pieces

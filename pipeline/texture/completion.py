@@ -1,0 +1,240 @@
+"""Completion of what no frame showed well, from what frames did, within its own segment of the body.
+
+For each vertex a *guess* is made of what is known elsewhere (``guess``): its mirror image where the other
+side was seen, else what was seen on the same ring of the same limb, else of its segment. So garments end
+where they end in front, and a print on the chest, which the ring's mean levels, is not carried to the back.
+Hair is the scalp's own: what resembles the skin of the face there, at the hairline, is no source.
+What is known beside it then bends the guess until both meet without a step, over a few centimetres
+(``screened_membrane`` of the difference: Perez et al., Poisson image editing, 2003).
+
+The unseen side is not lit as the seen one: the lamp of a frontal clip stands in front. So log brightness is
+fitted as ``c_part + b . n`` over the known vertices, n being the normal in the world, robustly, since
+materials differ within a part too; ``b . n`` is then known for every vertex, and is held to the range that
+was seen, for nothing says how dark it gets beyond (``shading``).
+
+Everything blends continuously by trust: 1 keeps a vertex as it is, 0 takes the completion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sparse
+
+from pipeline.texture.membrane import neighbours, screened_membrane
+from pipeline.texture.segments import BODY, FACE, NECK, OTHER_SIDE, SCALP, SKIN, Segments
+
+REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
+"""Metres over which what is known beside a guess bends it; hands as the rest."""
+
+RINGS = ((0.012, 1.0), (0.05, 1e-3), (10.0, 1e-6))  # widths along a limb, metres, and what each counts
+BIN = 0.004  # metres along a limb
+FIRM = 50.0  # how firmly a wholly trusted vertex is held, against an edge's 1
+SKIN_LIKE = 0.13  # distance of two colours, in [0, 1], at which they are hardly of one kind
+LEAST_SOURCE = 0.02  # what the skin's own colour still counts as a source of hair or cloth
+DARK = 4.0 / 255  # mean colour: logarithms below say nothing
+ROUNDS = 10  # of reweighting
+SOFT = 0.15  # of log brightness, where an error begins to count linearly
+RANGE = (2.0, 98.0)  # percentiles of what was seen, to which shading is held
+LEAST = 200  # known vertices, under which there is nothing to fit
+RIDGE = 1e-3  # of the summed weight, on the slope
+
+
+def complete_colors(
+    segments: Segments,
+    color: np.ndarray,  # [N, 3]
+    trust: np.ndarray,  # [N]
+    normals: np.ndarray | None = None,  # [N, 3]
+) -> np.ndarray:
+    """A colour for every vertex: [N, 3] float64 in [0, 1].
+
+    Args:
+        segments: of the surface, N vertices.
+        color: RGB in [0, 1]; of no consequence where trust is 0.
+        trust: in [0, 1].
+        normals: mean normals in the world over the frames, short where the body turned; light is left out
+            of account if None.
+    """
+    if not (trust > 0).any():
+        return np.full((len(segments), 3), 0.5)
+    source = spreading(segments, color, trust)
+    shade = np.ones((len(segments), 1))
+    if normals is not None:
+        shade = np.exp(shading(color, source, normals, segments.part))[:, None]
+    guessed = guess(segments, color / shade, source)
+    return np.clip(completed(segments, color / shade, guessed, trust, source) * shade, 0, 1)
+
+
+def complete_log_scales(
+    segments: Segments,
+    log_scale: np.ndarray,  # [N, C]
+    trust: np.ndarray,  # [N]
+) -> np.ndarray:
+    """A log scale for every vertex, [N, C] float64: 0, which covers, where nothing is known."""
+    return completed(segments, log_scale, np.zeros_like(log_scale), trust, trust)
+
+
+def completed(
+    segments: Segments,
+    values: np.ndarray,  # [N, C]
+    guessed: np.ndarray,  # [N, C]
+    trust: np.ndarray,  # [N]
+    source: np.ndarray,  # [N]
+) -> np.ndarray:
+    """Values where they are trusted, guesses bent to meet them where not: [N, C] float64.
+
+    Args:
+        segments: of the surface.
+        values: what was learnt; of no consequence where trust is 0.
+        guessed: of every vertex.
+        trust: in [0, 1]; a vertex of trust 1 keeps its value exactly.
+        source: [N] in [0, 1], how far each value may bend what lies beside it.
+    """
+    values = np.asarray(values, np.float64)
+    share = np.clip(trust, 0, 1)[:, None].astype(np.float64)
+    if (share == 1).all():
+        return values.copy()
+    hold = _hold(source)
+    reach = np.array([REACH.get(label, REACH[BODY]) for label in range(segments.label.max() + 1)])
+    sink = np.maximum((segments.spacing / reach[segments.label]) ** 2, 1e-6)
+    difference = np.where(source[:, None] > 0, values - guessed, 0)
+    bent = screened_membrane(neighbours(segments.edges, len(segments)), difference, hold, sink)
+    mixed = share * np.where(share > 0, values, 0) + (1 - share) * (guessed + bent)
+    return np.where(share == 1, values, mixed)
+
+
+def _hold(trust: np.ndarray) -> np.ndarray:
+    return FIRM * trust**2 / (1 - trust + 1e-2)
+
+
+def spreading(
+    segments: Segments,
+    color: np.ndarray,  # [N, 3]
+    trust: np.ndarray,  # [N]
+) -> np.ndarray:
+    """How far each vertex may be a source of others: [N] float64 in [0, 1].
+
+    It is trust, and less on scalp and body where the colour is that of the face's skin: a forehead under the
+    hairline, the neck above a collar. Where all of a segment is of that colour all of it counts alike.
+    """
+    face = segments.is_in(FACE)
+    source = np.clip(trust, 0, 1).astype(np.float64)
+    if not (trust[face] > 0).any():
+        return source
+    skin = weighted_median(color[face], source[face])
+    like = np.exp(-(distance(color, skin) ** 2) / (2 * (SKIN_LIKE / 2) ** 2))
+    for label in (SCALP, BODY):
+        rows = segments.is_in(label)
+        source[rows] *= np.maximum(1 - like[rows], LEAST_SOURCE)
+        largest = source[rows].max(initial=0.0)
+        source[rows] /= max(largest, 1e-12) if 0 < largest < 0.5 else 1.0
+    return source
+
+
+def distance(color: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distances of colours [N, 3] from another [3] in which brightness counts half as much as hue: [N]."""
+    away = color - other
+    grey = away.mean(1, keepdims=True)
+    return np.sqrt(np.square(away - grey).sum(1) + 0.25 * 3 * np.square(grey[:, 0]))
+
+
+def guess(
+    segments: Segments,
+    values: np.ndarray,  # [N, C]
+    source: np.ndarray,  # [N]
+) -> np.ndarray:
+    """What each vertex is most likely to be, told by others: [N, C] float64.
+
+    The mirror image as far as that is known, else the ring of the limb; scalp and face have no rings, there
+    it is the median. A segment of skin without any source takes other skin's, any other the mean of all.
+    """
+    weight, values = source**2, np.asarray(values, np.float64)
+    everywhere = np.average(values, axis=0, weights=weight + 1e-12)
+    bare = segments.is_in(*SKIN) & (weight > 0)
+    skin = weighted_median(values[bare], weight[bare]) if bare.any() else everywhere
+    found = np.tile(everywhere, (len(segments), 1))
+    for label in np.unique(segments.label):
+        rows = segments.is_in(label)
+        known = weight[rows].sum() > 0
+        if not known:
+            found[rows] = skin if label in SKIN else everywhere
+        elif label in (FACE, SCALP):
+            found[rows] = weighted_median(values[rows], weight[rows])
+        else:
+            _fill_rings(found, rows, segments, values, weight)
+    mirrored = segments.mirrored
+    same = segments.label[mirrored] == OTHER_SIDE[segments.label]
+    share = (source[mirrored] * same)[:, None]
+    return share * values[mirrored] + (1 - share) * found
+
+
+def _fill_rings(
+    found: np.ndarray, rows: np.ndarray, segments: Segments, values: np.ndarray, weight: np.ndarray
+) -> None:
+    """Writes means over rings of each limb into rows of ``found``."""
+    whole = np.average(values[rows], axis=0, weights=weight[rows])
+    for part in np.unique(segments.part[rows]):
+        limb = np.flatnonzero(rows & (segments.part == part))
+        found[limb] = whole
+        if weight[limb].sum() > 0:
+            found[limb] = _ring_means(segments.along[limb], values[limb], weight[limb])
+
+
+def _ring_means(along: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted means of what lies at the same place along a limb, wider where nothing does: [K, C]."""
+    place = ((along - along.min()) / BIN).astype(int)
+    count = place.max() + 1
+    heft = np.bincount(place, weight, count)
+    sums = np.stack([np.bincount(place, weight * column, count) for column in values.T], axis=1)
+    away = BIN * np.abs(np.arange(count)[:, None] - np.arange(count))
+    kernel = sum(share * np.exp(-0.5 * (away / width) ** 2) for width, share in RINGS)
+    return ((kernel @ sums) / np.maximum(kernel @ heft, 1e-30)[:, None])[place]
+
+
+def weighted_median(
+    values: np.ndarray,  # [N, C]
+    weights: np.ndarray,  # [N]
+) -> np.ndarray:
+    """The value, of each column, at which half of the weight is reached: [C] float64."""
+    order = np.argsort(values, axis=0, kind="stable")
+    reached = np.cumsum(weights[order], axis=0)
+    place = (reached >= 0.5 * reached[-1:]).argmax(0)
+    return np.take_along_axis(values, np.take_along_axis(order, place[None], 0), 0)[0].astype(np.float64)
+
+
+def shading(color: np.ndarray, weight: np.ndarray, normal: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """The logarithm of each vertex's shading: [N] float64.
+
+    Args:
+        color: [N, 3], RGB in [0, 1].
+        weight: [N], 0 where the colour is not known.
+        normal: [N, 3], mean normals in the world; short where the body turned.
+        part: [N] int, each with a brightness of its own.
+    """
+    known = np.flatnonzero((weight > 0) & (color.mean(1) > DARK))
+    if len(known) < LEAST:
+        return np.zeros(len(color))
+    brightness = np.log(color[known].mean(1))
+    share, groups = np.minimum(weight[known], np.median(weight[known])), part[known]
+    slope, level = np.zeros(3), np.zeros(int(part.max()) + 1)
+    robust = np.ones(len(known))
+    for _ in range(ROUNDS):
+        heft = share * robust
+        total = np.maximum(_sums(groups, heft, len(level)), 1e-12)
+        # Parts' levels are taken out first: what is left is a fit of three numbers.
+        centred = (
+            normal[known]
+            - (_sums(groups, heft[:, None] * normal[known], len(level)) / total[:, None])[groups]
+        )
+        level_now = (_sums(groups, heft * brightness, len(level)) / total)[groups]
+        square = (heft[:, None] * centred).T @ centred + RIDGE * heft.sum() * np.eye(3)
+        slope = np.linalg.solve(square, (heft[:, None] * centred).T @ (brightness - level_now))
+        error = np.abs(brightness - level_now - centred @ slope)
+        robust = np.minimum(1, SOFT / np.maximum(error, 1e-9))
+    shade = normal @ slope
+    return np.clip(shade, *np.percentile(shade[known], RANGE))
+
+
+def _sums(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Sums of values [K] or [K, C] by group: [count] or [count, C]."""
+    pick = sparse.coo_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))), (count, len(groups)))
+    return np.asarray(pick @ values)

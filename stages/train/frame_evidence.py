@@ -1,0 +1,82 @@
+"""The evidence that training frames give of an avatar, and what is done with it when training has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from pipeline.avatar import Avatar
+from pipeline.avatar.canonical import dilate
+from pipeline.avatar.completion import complete_avatar
+from pipeline.avatar.evidence import Evidence, gather_evidence
+from pipeline.clip.frames import spread_from_start
+from pipeline.clip.views import View
+from pipeline.device import moved
+from pipeline.splat import Gaussians
+from stages.train.data import TrainingData
+from stages.train.poses import PoseRefinement
+from stages.train.settings import TrainSettings
+
+
+def evidence_of(
+    avatar: Avatar,
+    poses: PoseRefinement,
+    data: TrainingData,
+    captured: tuple[int, ...],
+    made: tuple[int, ...] = (),
+) -> Evidence:
+    """The evidence of an avatar's ungated Gaussians, in the poses as they now are.
+
+    Args:
+        avatar: as trained so far.
+        poses: of every frame.
+        data: the frames.
+        captured: frame numbers, at least one.
+        made: generated frames; they are asked for what no captured frame shows.
+    """
+    with torch.no_grad():
+        decoded = avatar.decode()
+
+    def shown(frames: tuple[int, ...]) -> Iterator[tuple[Gaussians, View]]:
+        for frame in frames:
+            seconds = data.clip.seconds.get(frame)
+            with torch.no_grad():
+                gaussians = avatar.pose(decoded, poses(frame), time=seconds).gaussians
+            yield gaussians, moved(data.view(frame), avatar.device)
+
+    found = gather_evidence(shown(captured), decoded.surface)
+    return found.filled(gather_evidence(shown(made), decoded.surface)) if made else found
+
+
+def settle_unseen(
+    avatar: Avatar, poses: PoseRefinement, data: TrainingData, settings: TrainSettings
+) -> Evidence:
+    """Gives an avatar, after training, what ``train.unseen`` says where no frame showed enough.
+
+    Args:
+        avatar: trained; it is changed.
+        poses: as training left them.
+        data: that it was learnt from.
+        settings: of the stage.
+
+    Returns:
+        The evidence that this was decided by.
+    """
+    captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
+    evidence = evidence_of(avatar, poses, data, captured, made)
+    if settings.unseen in ("completed", "base"):
+        complete_avatar(avatar, evidence)
+    if settings.unseen == "nothing":
+        leave_seen(avatar, evidence)
+    return evidence
+
+
+def leave_seen(avatar: Avatar, evidence: Evidence) -> None:
+    """Gates the body vertices that no frame showed, one ring around the others excepted."""
+    coarse, surface = avatar.surfaces[0].canonical, avatar.surface()
+    trust = torch.zeros(len(avatar.trust), device=avatar.device)
+    trust[surface.pick(torch.arange(len(trust), device=avatar.device))] = evidence.shape_trust
+    seen = dilate(trust[: len(coarse)] > 0, coarse.faces, rings=1) & avatar.active
+    if bool(seen.any()):
+        avatar.gate(seen)
