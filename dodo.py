@@ -18,6 +18,7 @@ What is stale is decided by the store (``pipeline.run.job``), never by doit's ow
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import shutil
@@ -32,6 +33,7 @@ from pipeline.config.datasets import known_datasets, subjects_of
 from pipeline.config.request import Request, parse_request
 from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
+from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
 from pipeline.run.effect import check_effect, named_tasks
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
@@ -136,8 +138,25 @@ def is_current(stage: str, subject: str) -> bool:
         return False
 
 
+def asked_stages() -> list[str]:
+    """The stages that the command line asks for, by name or by leaving all names out."""
+    return [name for word in sys.argv[1:] if (name := word.partition(":")[0]) in STAGES] or DEFAULT
+
+
+@functools.cache
+def compile_once(functions: tuple[str, ...]) -> None:
+    """Starts to compile kernels, unless that was done before."""
+    start_compiling(functions)
+
+
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
-    """Runs a stage in a process of its own, which writes to this terminal itself."""
+    """Runs a stage in a process of its own, which writes to this terminal itself.
+
+    Beside it, the kernels of the stages after it are compiled where they never were.
+    """
+    with contextlib.suppress(UserError, OSError):  # the stage itself reports it
+        job = job_of(subject)
+        compile_once(kernels_ahead(job, job.upstream_first(asked_stages()), stage))
     reason = run_stage_process(stage, subject, REQUEST)
     return TaskFailed(reason) if reason else None
 

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from pipeline.config.request import Request
@@ -51,11 +51,15 @@ def run_stage_process(stage: str, subject: str, request: Request, log: Path | No
         reason = Path(folder) / "reason"
         environment = {**process_environment(), REASON: str(reason)}
         command = stage_command(stage, subject, request)
-        prepare = functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
         with contextlib.ExitStack() as stack:
             out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
             status = subprocess.run(
-                command, env=environment, stdout=out, stderr=out, check=False, preexec_fn=prepare
+                command,
+                env=environment,
+                stdout=out,
+                stderr=out,
+                check=False,
+                preexec_fn=ending_with_this_process(),
             ).returncode
         said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
     if status < 0:
@@ -98,6 +102,11 @@ def killed_by(number: int) -> str:
     if name == " (SIGKILL)":
         likely = ", often the system's when memory runs out: run fewer subjects at once or a smaller preset"
     return f"killed by signal {number}{name}{likely}; the same command goes on from here"
+
+
+def ending_with_this_process() -> Callable[[], None] | None:
+    """The function that a started process calls first, so that it ends with this one; None off Linux."""
+    return functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
 
 
 def _end_with(parent: int) -> None:
