@@ -80,7 +80,7 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
     return request, chosen
 
 
-def task_words() -> list[tuple[str, str]]:
+def tasks_named() -> list[tuple[str, str]]:
     """The tasks that the command line names: ``fit:oliver`` is ("fit", "oliver")."""
     words = [word.partition(":") for word in sys.argv[1:] if "=" not in word and not word.startswith("-")]
     return [(kind, subject) for kind, _, subject in words]
@@ -89,7 +89,7 @@ def task_words() -> list[tuple[str, str]]:
 def named_subjects(request: Request) -> set[str]:
     """The subjects of the tasks that the command line names."""
     kinds = {*load_stages(request.workspace.stages), *CARE}
-    return {subject for kind, subject in task_words() if kind in kinds and subject and "*" not in subject}
+    return {subject for kind, subject in tasks_named() if kind in kinds and subject and "*" not in subject}
 
 
 def stored_subjects(request: Request) -> tuple[str, ...]:
@@ -99,7 +99,7 @@ def stored_subjects(request: Request) -> tuple[str, ...]:
 
 def kept_subjects(request: Request) -> set[str]:
     """Those of whom only stored results are asked for: to check and delete these no footage is needed."""
-    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in task_words())
+    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in tasks_named())
     return set(stored_subjects(request)) if cares else set()
 
 
