@@ -1,8 +1,8 @@
 """The frames that training draws: all of a short clip, the most different ones of a long clip.
 
-A frame teaches little when it is drawn once or twice: its pose is not refined by then, and what disagrees with
-it is blurred. So a clip with more frames than the steps can visit often enough is learnt from fewer of them,
-chosen to lie as far from each other as they can in pose, expression and view.
+A frame teaches little when it is drawn once or twice: its pose is not refined by then, and what disagrees
+with it is blurred. So a clip with more frames than the steps can visit often enough is learnt from fewer of
+them, chosen to lie as far from each other as they can in pose, expression and view.
 """
 
 from __future__ import annotations
