@@ -40,6 +40,7 @@ from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.body import Pose
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over
+from pipeline.device import moved
 from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
@@ -199,14 +200,16 @@ def regularisers(decoded: Decoded, posed: Posed) -> Tensor:
 
 @torch.no_grad()
 def frames_of(avatar: Avatar, count: int, size: int) -> list[Frame]:
-    """Random poses and random pictures."""
-    generator, camera, decoded = torch.Generator().manual_seed(2), avatar_camera(size), avatar.decode()
+    """Random poses and random pictures, on the avatar's device."""
+    generator, decoded = torch.Generator().manual_seed(2), avatar.decode()
+    camera = moved(avatar_camera(size), avatar.device)
     frames = []
-    for pose in poses_of(avatar, count):
+    for pose in moved(poses_of(avatar, count), avatar.device):
         target = torch.rand(size, size, 3, generator=generator)
         background = torch.rand(3, generator=generator)
         weights = render(avatar.pose(decoded, pose).gaussians, camera).weights
-        frames.append(Frame(pose, camera, target, background, torch.nonzero(weights)[:, 0]))
+        drawn = moved((target, background), avatar.device)
+        frames.append(Frame(pose, camera, *drawn, torch.nonzero(weights)[:, 0]))
     return frames
 
 

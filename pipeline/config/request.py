@@ -121,6 +121,8 @@ def parse_request(words: Iterable[str] | Mapping[str, str], subject: str = "") -
     for name, text in pairs.items():
         if "." not in name and name in (*FIELDS, *PLACES) and not text.strip(" ,"):
             raise UserError(f"{ORIGIN}: {name}= names nothing; leave it out, or say what is meant")
+    if "data" in pairs and not Path(pairs["data"]).is_dir():
+        raise UserError(f"{ORIGIN}: data={pairs['data']} is no folder; make it first, or leave data= out")
     workspace = open_workspace(**{name: pairs[name] for name in PLACES if name in pairs})
     stages = load_stages(workspace.stages)
     pairs = _with_stage_names(pairs, stages)

@@ -191,9 +191,9 @@ def preset_layer(workspace: Workspace, name: str) -> Layer:
 
 def preset_path(workspace: Workspace, name: str) -> Path:
     """A preset's file; UserError where there is none."""
-    path = workspace.data / "presets" / f"{name}.toml"
+    path = workspace.definitions("presets") / f"{name}.toml"
     if not path.is_file():
-        known = sorted(file.stem for file in (workspace.data / "presets").glob("*.toml"))
+        known = sorted(file.stem for file in (workspace.definitions("presets")).glob("*.toml"))
         raise UserError(
             f"preset={name}: there is no such preset; there are {', '.join(known)}{near(name, known)}"
         )

@@ -73,9 +73,11 @@ class Stage:
         loans: what it reads of other subjects.
         idle: of a settings object, the settings that it cannot use: name -> what to write instead. Naming one
             on the command line is an error.
+        compile_ahead: ``"module:function"`` that calls the stage's kernels once, so that numba compiles
+            them, see ``pipeline.run.compile_ahead``; empty for none.
 
-    ``assets``, ``reads_source``, ``reads_body`` and ``loans`` may be functions of the settings object, so
-    that a stage asks only for what these settings call for.
+    ``assets``, ``reads_source``, ``reads_body``, ``loans`` and ``compile_ahead`` may be functions of the
+    settings object, so that a stage asks only for what these settings call for.
     """
 
     name: str
@@ -92,6 +94,11 @@ class Stage:
     words: tuple[str, ...] = ()
     loans: tuple[Loan, ...] | Callable[[Any], tuple[Loan, ...]] = ()
     idle: Callable[[Any], Mapping[str, str]] | None = None
+    compile_ahead: str | Callable[[Any], str] = ""
+
+    def kernels_of(self, settings: Any) -> str:
+        """The function that compiles the stage's kernels under these settings; empty for none."""
+        return self.compile_ahead(settings) if callable(self.compile_ahead) else self.compile_ahead
 
     def demands(self, settings: Any) -> Demands:
         """What the stage asks for under these settings."""

@@ -21,7 +21,7 @@ from stages.ingest.mask_files import read_given_mask
 from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, SourceFrame, read_clip
+from stages.ingest.video import Clip, SourceFrame, missing_frames, read_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -182,8 +182,8 @@ def count_people(context: Context, clip: Clip, sources: DetectionSources) -> tup
     every = max(1, round((clip.fps or SEARCHES_A_SECOND) / settings.stride / SEARCHES_A_SECOND))
     found, total = [], 0
     with context.progress(_expected(clip, settings), "people") as progress:
-        for picture in read_clip(clip, settings.stride, settings.max_frames):
-            if total % every == 0:
+        for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
+            if total % every == 0 and not picture.damaged:
                 found.append((picture.index, detector.detect(picture.image)))
             total += 1
             progress.advance()
@@ -207,9 +207,9 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
     dropped: Counter[str] = Counter()
     numbers: set[int] = set()
     with context.progress(total or _expected(clip, settings), "frames") as progress:
-        for picture in read_clip(clip, settings.stride, settings.max_frames):
+        for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
             numbers.add(picture.index)
-            seen = detector.detect_frame(picture)
+            seen = "damaged" if picture.damaged else detector.detect_frame(picture)
             if isinstance(seen, str):
                 dropped[seen] += 1
                 if seen == OFF_MASK:
@@ -225,6 +225,10 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
                     write_segmentations(raw_masks, picture.index, *seen.masks)
                 kept.append((picture.index, picture.seconds, dataclasses.replace(seen, masks=())))
             progress.advance()
+    if not settings.max_frames:
+        lacking = missing_frames(clip, settings.stride)
+        numbers |= lacking
+        dropped += Counter({"cut off": len(lacking)})
     if settings.stride == 1 and not settings.max_frames:
         check_frames(sources, numbers)
     check_agreement(detector.agreements)

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
-from pipeline.untrusted import check_picture
+from pipeline.untrusted import GIGABYTE, bounded_bytes, check_picture
 
 LOOKED_AT = 24  # masks whose encoding is looked at
 _LABELS = 64  # different values at most, where they are labels
@@ -157,7 +157,7 @@ def _look_at(file: Path) -> _Look:
 
 def _decode(path: Path) -> _Channels:
     """A mask file's channels; UserError where it is damaged or too large."""
-    data = np.fromfile(path, np.uint8)
+    data = np.frombuffer(bounded_bytes(path, GIGABYTE, _REMEDY), np.uint8)
     check_picture(path, _REMEDY, data.tobytes())
     palette = _palette_labels(path)
     if palette is not None:

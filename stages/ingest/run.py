@@ -38,6 +38,9 @@ def run(context: Context) -> None:
     recording = open_recording(context.source, settings)
     if recording.layout != "plain":
         context.log(describe_layout(recording))
+    for shot in recording.shots:
+        for note in shot.clip.notes:
+            context.log(f"{shot.clip.path.name}: {note}")
     for folder in ("frames", "masks"):
         (output / folder).mkdir(parents=True)
     found = ingest_recording(context, recording)

@@ -41,6 +41,9 @@ class IngestSettings:
     long_side: Side = setting(512, "pixels; larger footage is stored at this size, smaller footage as it is")
     stride: Count = setting(1, "every stride-th frame is looked at")
     max_frames: CountOrNone = setting(0, "how many frames are looked at, 0 for all")
+    damaged: Literal["refuse", "skip"] = setting(
+        "refuse", "footage that is cut off or damaged: refuse it, or skip the frames that are not whole"
+    )
     layout: Literal["auto", Layout] = setting("auto", "how the source lies on disk: plain, or a dataset's")
     keypoints: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of mmpose/DWPose JSON, one a frame"

@@ -45,7 +45,7 @@ def run(context: Context) -> None:
         UserError: if the inputs do not go together, or training diverges.
         NotFiniteError: a number of it is not finite; names it, the iteration and the frame.
     """
-    with threads(context.settings.threads), compile_timer() as compiled:
+    with threads(context.settings.threads), compile_timer(context.log) as compiled:
         train_subject(context, compiled)
         context.timing("compile_seconds", compiled.seconds)
         context.timing("compile_cpu_seconds", compiled.cpu_seconds)

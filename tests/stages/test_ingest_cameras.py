@@ -28,6 +28,7 @@ from stages.ingest.cameras.distortion import (
     without_distortion,
 )
 from stages.ingest.cameras.extrinsics import FACING, interpolate_gaps, to_upright_world
+from stages.ingest.display_matrix import Orientation
 from stages.ingest.run import run
 from stages.ingest.video import Clip
 from tests.made.room import (
@@ -279,7 +280,7 @@ def test_a_lens_is_turned_and_scaled_with_the_frames(tmp_path: Path) -> None:
     point = rotation.T @ (np.array([0.2, -0.1, 2.0]) - translation)
     x, y = np.asarray(lens.img_from_cam(rotation @ point + translation))
     for turns, expected in ((1, (y, 200 - x)), (3, (100 - y, x))):
-        clip = clip_of(size=(100, 200), turns=turns)
+        clip = clip_of(size=(100, 200), orientation=Orientation(turns))
         view = for_stored_frames(CalibratedCamera(lens, rotation, translation), clip, 50, 100, tmp_path)
         found = view.lens.img_from_cam(view.rotation @ point + view.translation)
         np.testing.assert_allclose(found, np.array(expected) / 2, atol=1e-9)

@@ -189,7 +189,7 @@ def test_any_names_of_pictures_find_theirs(folder, chosen, offset, padding, afte
 @FAST
 @given(folders(), st.integers(2, 500))
 def test_any_other_offset_is_refused_or_said(folder, offset):
-    """Nothing is shifted in silence: numbers that do not fit are strangers, unless the user says the offset."""
+    """Nothing is shifted in silence: numbers that do not fit are strangers, or the user says the offset."""
     count, name = folder
     names = [name(number + offset) for number in range(count)]
     assert match_names(names, video(count), HERE).strangers
