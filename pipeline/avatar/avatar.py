@@ -272,13 +272,9 @@ class Avatar(nn.Module):
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         condition = Condition(theta, pose.expression, time)
-        # One pass computes on a CPU, for all Gaussians, and knows no pose correctives.
-        if (
-            self.at_once
-            and rows is None
-            and canonical.pose_directions is None
-            and kernels_serve(decoded.offset)
-        ):
+        # One pass computes on a CPU, for all Gaussians, and knows neither pose correctives nor completion.
+        plain = canonical.pose_directions is not None or len(self.completion) > 0 or rows is not None
+        if self.at_once and not plain and kernels_serve(decoded.offset):
             linear = self.representation.linear_change(decoded, condition)
             if linear is not None:
                 return self._pose_at_once(decoded, linear, transforms, pose)

@@ -93,7 +93,7 @@ class BakedAvatar:
         transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
         condition = Condition(theta, pose.expression, time)
         linear = self.representation.linear_change(condition)
-        if linear is not None and not len(constants.correctives):
+        if linear is not None and not len(constants.correctives) and constants.pose_share is None:
             return self._pose_at_once(linear, transforms, pose)
         points = rest = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit

@@ -51,9 +51,8 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
     """
     decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
-    trust = evidence.together
-    avatar.trust.index_copy_(0, rows, trust.to(avatar.trust))
-    if bool((trust == 1).all()):
+    avatar.trust.index_copy_(0, rows, evidence.together.to(avatar.trust))
+    if bool((evidence.together == 1).all()):
         return
     avatar.take_completion(rows, completed_values(decoded, evidence))
 

@@ -199,7 +199,7 @@ class Representation(nn.Module, abc.ABC):
         """Undoes what was learnt where nothing was to be seen; called once, after training.
 
         Args:
-            seen: [N] bool, the Gaussians of the finest level that a training frame showed.
+            seen: [N] bool, the Gaussians of the finest level of which there is any evidence.
         """
 
     def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from pipeline.config.request import Request
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.run.job import Job
 from pipeline.run.stage import usual
@@ -30,7 +31,8 @@ def stage_command(stage: str, subject: str, request: Request) -> list[str]:
     words = request.about(subject).words()
     words.pop("subject", None)
     pairs = [f"{name}={value}" for name, value in words.items()]
-    return [sys.executable, "-m", "pipeline", stage, "--subject", subject, *pairs]
+    # -P: a folder called pipeline where the user stands is not taken for this package.
+    return [sys.executable, "-P", "-m", "pipeline", stage, "--subject", subject, *pairs]
 
 
 def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
@@ -76,7 +78,7 @@ def leave_reason(message: str) -> None:
 
 
 def process_environment() -> dict[str, str]:
-    """The environment of a stage's process.
+    """The environment of a stage's process, which finds the packages from wherever the user stands.
 
     The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
     zeroed pages at every step; they must be set before Python starts.
@@ -86,7 +88,8 @@ def process_environment() -> dict[str, str]:
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
     }
-    return {**defaults, **os.environ}
+    places = (str(REPOSITORY), os.environ.get("PYTHONPATH", ""))
+    return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
 
 
 def killed_by(number: int) -> str:

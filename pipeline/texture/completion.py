@@ -103,7 +103,7 @@ def completed(
 
 
 def _hold(trust: np.ndarray) -> np.ndarray:
-    return FIRM * trust**2 / (1 - trust + 1e-2)
+    return FIRM * trust**2
 
 
 def spreading(

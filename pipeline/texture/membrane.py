@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import cg
 
-TOLERANCE, ITERATIONS = 1e-4, 600
+TOLERANCE, ITERATIONS = 1e-7, 1000
 
 
 def neighbours(edges: np.ndarray, count: int) -> sparse.csr_matrix:

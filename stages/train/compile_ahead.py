@@ -17,7 +17,6 @@ from pipeline.clip.camera import Camera, facing_camera
 from pipeline.config.workspace import open_workspace
 from pipeline.metrics import ssim_loss
 from pipeline.splat import render
-from stages.train.laplacian_kernel import mean_laplacian
 
 SIDE = 16  # pixels
 TRANSL = (0.0, 0.4, -3.0)  # metres: before the camera
@@ -57,8 +56,6 @@ def learn(avatar: Avatar, pose: Pose, camera: Camera, rows: Tensor | None) -> No
     decoded = avatar.decode()
     gaussians = avatar.pose(decoded, learnt, time=0.5, rows=rows).gaussians
     image = render(gaussians, camera).color
-    different = ssim_loss(image, torch.full_like(image, 0.5))
-    rough = mean_laplacian(gaussians.colors, decoded.surface.neighbours)
-    (different + rough).backward()
+    ssim_loss(image, torch.full_like(image, 0.5)).backward()
     picture = np.zeros((SIDE, SIDE, 3), np.uint8)
     draw_mesh(picture, camera, gaussians.means, decoded.surface.canonical.faces)

@@ -65,18 +65,19 @@ def settle_unseen(
     """
     captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
     evidence = evidence_of(avatar, poses, data, captured, made)
+    rows = avatar.surface().pick(torch.arange(len(avatar.trust), device=avatar.device))
+    avatar.trust.index_copy_(0, rows, evidence.together)
+    avatar.representation.forget_unseen(avatar.trust.amax(1) > 0)
     if settings.unseen in ("completed", "base"):
         complete_avatar(avatar, evidence)
     if settings.unseen == "nothing":
-        leave_seen(avatar, evidence)
+        leave_seen(avatar)
     return evidence
 
 
-def leave_seen(avatar: Avatar, evidence: Evidence) -> None:
+def leave_seen(avatar: Avatar) -> None:
     """Gates the body vertices that no frame showed, one ring around the others excepted."""
-    coarse, surface = avatar.surfaces[0].canonical, avatar.surface()
-    trust = torch.zeros(len(avatar.trust), device=avatar.device)
-    trust[surface.pick(torch.arange(len(trust), device=avatar.device))] = evidence.shape_trust
-    seen = dilate(trust[: len(coarse)] > 0, coarse.faces, rings=1) & avatar.active
+    coarse = avatar.surfaces[0].canonical
+    seen = dilate(avatar.trust[: len(coarse), 1] > 0, coarse.faces, rings=1) & avatar.active
     if bool(seen.any()):
         avatar.gate(seen)

@@ -69,17 +69,6 @@ class FrameVisibilityCache(nn.Module):
         self.bits[place] = (visible.view(-1, 8) * powers).sum(1, dtype=torch.uint8)
         self.levels[place] = level
 
-    def ever_visible(self, count: int) -> Tensor:
-        """True for Gaussians that any frame showed when it was last drawn, [count] bool.
-
-        Args:
-            count: Gaussians of the finest level, which the frames must have been drawn at.
-        """
-        together = torch.zeros_like(self.bits[0])
-        for bits in self.bits:
-            together |= bits
-        return _unpacked(together)[:count].bool()
-
 
 def _unpacked(bits: Tensor) -> Tensor:
     """The bits of bytes, the lowest first: [B] uint8 -> [8 B] uint8."""

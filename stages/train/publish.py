@@ -32,8 +32,6 @@ def publish(trainer: Trainer, curve: Curve, gate: VisibilityGate | None, output:
         output: the folder.
     """
     avatar, clip = trainer.avatar, trainer.data.clip
-    ever_visible = trainer.objective.visibility_cache.ever_visible(len(avatar.base_color))
-    avatar.representation.forget_unseen(ever_visible)
     settle_unseen(avatar, trainer.poses, trainer.data, trainer.settings)
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":

@@ -89,8 +89,8 @@ class TrainSettings:
     # smile (65 frames) lost 0.1 dB with 16 of them, carphone (108) gained 0.8 over 8 (docs/results.md).
     bases: BasesCount = setting(
         16,
-        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction that "
-        "the clip does not move in",
+        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction "
+        "that the clip does not move in",
     )
     edge_pixels: EdgePixels | None = setting(
         None,
@@ -231,7 +231,7 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
     """The settings that training really runs with.
 
     What the plan calls needless is switched off; it switches nothing on. Numbers that are left to it are its.
-    Then come the representation's own (``_for_bases``).
+    Then come the representation's own (``for_bases``).
     """
     needless = {part for part in PLANNED_RESIDUALS if not plan.on(f"{part}_residual")}
     parts = tuple(part for part in settings.residual_parts if part not in needless)
@@ -250,7 +250,7 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
         gate=settings.gate and plan.on("visibility_gate"),
         bases=settings.bases if plan.on("pose_heads") else 0,
     )
-    return _for_bases(applied) if settings.representation == "bases" else applied
+    return for_bases(applied) if settings.representation == "bases" else applied
 
 
 def planned_steps(settings: TrainSettings, plan: Plan) -> int:
@@ -259,7 +259,7 @@ def planned_steps(settings: TrainSettings, plan: Plan) -> int:
     return max(1, round(settings.effort * more * plan["steps"].values[0]))
 
 
-def _for_bases(settings: TrainSettings) -> TrainSettings:
+def for_bases(settings: TrainSettings) -> TrainSettings:
     """The settings as linear bases need them.
 
     They are trained on the fine mesh from the first step: a subdivision on the way costs 4 to 5 dB, most of

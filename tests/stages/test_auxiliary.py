@@ -147,7 +147,7 @@ def test_a_membrane_without_a_screen_is_straight_between_its_ends():
     count = 11
     chain = np.stack([np.arange(count - 1), np.arange(1, count)], 1)
     values, hold = np.zeros((count, 1)), np.zeros(count)
-    values[-1], hold[[0, -1]] = 10, 1e6
+    values[-1], hold[[0, -1]] = 10, 1e4
     found = screened_membrane(neighbours(chain, count), values, hold, np.full(count, 1e-9))
     assert found[:, 0] == pytest.approx(np.arange(count), abs=1e-2)
 

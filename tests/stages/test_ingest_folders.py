@@ -44,8 +44,8 @@ def ingest(material: Path, name: str = "run", source: str = "clip.mp4", **settin
 
 def test_everything_is_published(material: Path) -> None:
     output = ingest(material)
-    expected = {"frames", "masks", "keypoints.parquet", "cameras.parquet", "split.json", "footage.json",
-                "preview.png"}  # fmt: skip
+    expected = {"frames", "masks", "foreground", "keypoints.parquet", "cameras.parquet", "split.json",
+                "footage.json", "preview.png"}  # fmt: skip
     assert {path.name for path in output.iterdir()} == expected
     truth, masks = walking_blob(COUNT)
     for index in range(COUNT):
@@ -68,7 +68,7 @@ def test_everything_is_published(material: Path) -> None:
 def test_equal_runs_give_equal_bytes(material: Path) -> None:
     first, second = ingest(material, "first"), ingest(material, "second")
     files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
-    assert len(files) == 2 * COUNT + 5
+    assert len(files) == 3 * COUNT + 5
     for file in files:
         assert (first / file).read_bytes() == (second / file).read_bytes(), file
 
@@ -192,7 +192,7 @@ def test_numbers_that_are_not_finite(material: Path, number: str) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [[], [[1, 2, 0.5]] * 132, [[1, 2]] * 133, [[1, 2, None]] * 133, [["a", "b", "c"]] * 133, {"people": []},
+    [[], [[1, 2, 0.5]] * 132, [[1, 2]] * 133, [[1, 2, None]] * 133, [["a", "b", "c"]] * 133, {"person": []},
      {"instance_info": 3}, {"instance_info": [{"keypoints": [[1, 2]] * 133}]},
      {"instance_info": [{"keypoints": [[1, 2]] * 20, "keypoint_scores": [1] * 20}]}],
 )  # fmt: skip

@@ -47,10 +47,11 @@ def test_a_surface_before_the_camera_is_known_in_its_colour():
 
 def test_what_lies_behind_another_surface_is_not_known():
     (front, faces), (behind, _) = sheet(1.0), sheet(1.05)
-    behind = behind * torch.tensor([0.6, 0.6, 1])
+    inner = (behind[:, :2].abs() < 0.24).all(1)  # the pieces along the border are halves
+    behind = behind * torch.tensor([0.8, 0.8, 1])
     found = evidence_of(torch.cat([front, behind]), torch.cat([faces, faces + 144]))
-    assert (found.trust[:144] == 1).all() and (found.trust[144:] < 0.5).all()
-    assert found.trust[144:].mean() < 0.02
+    hidden = found.trust[144:][inner]
+    assert (found.trust[:144] == 1).all() and hidden.mean() < 0.02 and hidden.max() < 0.5
 
 
 def test_what_faces_away_has_a_place_and_no_colour():

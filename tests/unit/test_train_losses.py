@@ -70,6 +70,12 @@ def test_scale_growth_has_a_penalty_and_shrinking_has_none():
     assert torch.equal(log_scale.grad != 0, log_scale.detach() > 0)
 
 
+def test_scale_shrink_is_the_other_half():
+    log_scale = torch.tensor([[-2.0, -0.1, 0.0], [0.5, 1.0, -1.0]])
+    both = losses.scale_growth(log_scale) + losses.scale_shrink(log_scale)
+    torch.testing.assert_close(both, log_scale.square())
+
+
 def test_outward_offsets_count_by_their_direction():
     normals = torch.tensor([[0.0, 0.0, 1.0]])
     assert float(losses.outward_offset(0.02 * normals, normals)) == pytest.approx(1, abs=0.01)
