@@ -277,7 +277,7 @@ def take_step(avatar: Avatar, optimizer: torch.optim.Optimizer, frames: list[Fra
     for one in frames:
         posed = avatar.pose(decoded, one.pose, rows=one.seen if seen else None)
         picture = photometric(render(posed.gaussians, one.camera), one.target, one.background)
-        losses.append(picture + regularisers(True, decoded, posed))
+        losses.append(picture + regularisers(decoded, posed))
     (torch.stack(losses).sum() / len(frames)).backward()
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)

@@ -66,7 +66,7 @@ def start_compiling(functions: tuple[str, ...]) -> subprocess.Popen[bytes] | Non
     lacking = [one for one in functions if not is_compiled(one)]
     if not lacking or cores() < 2:
         return None
-    command = [sys.executable, "-m", "pipeline.run.compile_ahead", *lacking]
+    command = [sys.executable, "-P", "-m", "pipeline.run.compile_ahead", *lacking]
     environment = {**process_environment(), **ONE_THREAD}
     with contextlib.suppress(OSError):
         process = subprocess.Popen(command, env=environment, preexec_fn=ending_with_this_process())
