@@ -24,6 +24,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from doit import get_initial_workdir
 from doit.exceptions import InvalidDodoFile, TaskFailed
@@ -59,7 +60,8 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
 
     The NAME=VALUE words are ours; doit itself takes them out of its task names.
     """
-    os.chdir(get_initial_workdir())  # relative paths are meant from where the user stands, also with doit -f
+    # Relative paths are meant from where the user stands, also with doit -f; outside of doit, from here.
+    os.chdir(get_initial_workdir() or Path.cwd())
     try:
         words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         request = parse_request(words)
