@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,10 +35,9 @@ def surface_segments(surface: Surface) -> Segments:
 
 def complete_color_logits(surface: Surface, evidence: Evidence) -> Tensor:
     """Logits of the colours that frames showed, completed where they showed none: [N, 3]."""
-    color, trust, normals = (
-        one.detach().double().cpu().numpy() for one in (evidence.color, evidence.trust, evidence.normals)
+    found = torch.from_numpy(
+        complete_colors(surface_segments(surface), *_arrays(evidence.color, *_of_color(evidence)))
     )
-    found = torch.from_numpy(complete_colors(surface_segments(surface), color, trust, normals))
     return torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(evidence.color)
 
 
@@ -47,7 +47,7 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
 
     Args:
         avatar: trained.
-        evidence: of its ungated Gaussians, N.
+        evidence: of its ungated Gaussians, N, see ``covering``.
     """
     decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
@@ -63,19 +63,21 @@ def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
     Offsets stay: what no frame shows must keep behind the silhouettes that frames do show, and training has
     put it there.
     """
-    segments = surface_segments(decoded.surface)
-    color, log_scale, trust, shape_trust, normals = (
-        one.detach().double().cpu().numpy()
-        for one in (
-            torch.sigmoid(decoded.color_logit), decoded.log_scale, evidence.trust,
-            evidence.shape_trust, evidence.normals,
-        )
-    )  # fmt: skip
-    like = decoded.offset
-    found = torch.from_numpy(complete_colors(segments, color, trust, normals))
+    segments, like = surface_segments(decoded.surface), decoded.offset
+    told = _arrays(torch.sigmoid(decoded.color_logit), *_of_color(evidence))
+    log_scale, shape_trust = _arrays(decoded.log_scale, evidence.shape_trust)
+    found = torch.from_numpy(complete_colors(segments, *told))
     logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
     return dataclasses.replace(
         decoded,
         color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
         log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, shape_trust)).to(like),
     )
+
+
+def _of_color(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:
+    return evidence.trust, evidence.normals, evidence.source
+
+
+def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
+    return tuple(one.detach().double().cpu().numpy() for one in tensors)

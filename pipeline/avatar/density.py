@@ -2,7 +2,7 @@
 
 The template has 56% of its vertices on head and hands and 12% on the torso. A Gaussian a vertex makes a face
 sharper than the pixels and turns a checked shirt to mush. So edges are split, round after round, where they
-are longer in some training frame than a given number of pixels. What no frame shows stays coarse.
+are longer in some training frame than a given number of pixels. What no frame shows stays coarser.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pipeline.clip.camera import Camera, project
 DENSITY_FRAMES = 12  # training frames, evenly spread, in which edges are measured
 MOST_ROUNDS = 6  # a sixty-fourth of an edge
 FACING = 0.1  # cosine of the angle between normal and line of sight: seen more obliquely counts as unseen
+AWAY = 0.35  # of an edge's length, where it is turned away: Gaussians as coarse as the template have halos
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,18 +31,21 @@ class Projections:
 
     Attributes:
         pixels: [V, S, 2].
-        facing: [V, S] float, 1 where a vertex lies in the picture and faces the camera.
+        facing: [V, S] float, 1 where a vertex lies in the picture and faces the camera, ``AWAY`` where it lies
+            in the picture and does not, 0 elsewhere.
     """
 
     pixels: Tensor  # [V, S, 2]
     facing: Tensor  # [V, S]
 
     def edge_pixels(self, pairs: Tensor) -> Tensor:
-        """The length of edges in the frame that shows them longest: [E, 2] -> [E]; 0 where none does."""
+        """The length of edges in the frame that shows them longest: [E, 2] -> [E]; 0 where none does.
+
+        Of what is turned away a part of the length counts.
+        """
         ends = pairs.unbind(1)
         length = (self.pixels[ends[0]] - self.pixels[ends[1]]).norm(dim=2)
-        shown = torch.maximum(self.facing[ends[0]], self.facing[ends[1]]) > 0
-        return torch.where(shown, length, torch.zeros_like(length)).amax(1)
+        return (length * torch.maximum(self.facing[ends[0]], self.facing[ends[1]])).amax(1)
 
 
 @torch.no_grad()
@@ -55,7 +59,7 @@ def project_surface(surface: Surface, frames: Iterable[tuple[Pose, Camera]]) -> 
         sight = torch.nn.functional.normalize(camera.centre - points, dim=1)
         towards = (tables.normals(transforms, canonical.vertices) * sight).sum(1) > FACING
         pixels.append(project(camera, points))
-        facing.append((towards & in_frame(camera, points)).float())
+        facing.append(in_frame(camera, points) * torch.where(towards, 1.0, AWAY))
     return Projections(torch.stack(pixels, 1), torch.stack(facing, 1))
 
 

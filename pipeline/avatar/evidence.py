@@ -10,7 +10,10 @@ whole clip is in every picture. Here a frame counts for a Gaussian by
 - its *squareness*: the cosine between the surface's normal and the view. Under ``GRAZING`` a frame says
   nothing, because a fit that is a little off shows the wall there.
 
-What looks at evidence asks for ``trust``, which is continuous.
+Evidence is asked of Gaussians that are large enough to cover (``covering``): one that has shrunk because it
+lies outside the mask would otherwise count as hidden, and be made whole. So no training frame changes when
+what evidence does not reach is completed. What looks at evidence asks for ``trust``, ``shape_trust`` or
+``source``, which are continuous.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from pipeline.avatar.representation import Decoded
 from pipeline.avatar.surface import Surface
 from pipeline.body.mesh import face_normals, vertex_normals
 from pipeline.clip.camera import Camera, project, to_camera
@@ -31,7 +35,9 @@ GRAZING, SQUARE = 0.0, 0.2  # cosines: nothing is learnt, all is learnt
 PERSON = 0.2, 0.7  # alpha: a pixel does not count, counts wholly
 LEAST_TRUST = 0.5  # from which a pixel of a generated frame counts
 HIDDEN, OPEN = 0.15, 0.4  # shares: what shines through from behind, what is plainly seen
-DOUBTED, TRUSTED = 0.01, 0.12  # mean over the frames: of a few frames in hundreds, and of one in eight
+PROTRUDES = 0.02, 0.1  # shares: wholly hidden, its rim looks out from behind a silhouette
+KEPT = 0.005, 0.04  # mean share: nothing, and all, of what was learnt is kept; one frame of 24 is enough
+TELLS = 0.01, 0.12  # likewise, of what others are told by: one frame in eight
 EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
 SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
 
@@ -43,13 +49,16 @@ class Evidence:
     Attributes:
         seen: [N] in [0, 1], mean over the frames of share and squareness together.
         frames: [N] in [0, 1], the part of the frames that showed it at all: the mean share.
+        shape: [N] in [0, 1], the same of all pixels, also those beside the person: an empty pixel is evidence
+            that nothing is there.
         facing: [N] in [0, 1], the mean cosine in the frames that showed it; 0 where none did.
-        color: [N, 3], its mean colour in them, RGB in [0, 1]; meaningless where ``seen`` is 0.
+        color: [N, 3], its mean colour in them, RGB in [0, 1]; meaningless where ``frames`` is 0.
         normals: [N, 3], its mean normal in the world over all the frames; short where the body turned.
     """
 
     seen: Tensor  # [N]
     frames: Tensor  # [N]
+    shape: Tensor  # [N]
     facing: Tensor  # [N]
     color: Tensor  # [N, 3]
     normals: Tensor  # [N, 3]
@@ -57,12 +66,17 @@ class Evidence:
     @property
     def trust(self) -> Tensor:
         """How far the colour that was learnt of each Gaussian is to be believed, [N] in [0, 1]."""
-        return ramp(self.seen, DOUBTED, TRUSTED)
+        return ramp(self.frames, *KEPT)
 
     @property
     def shape_trust(self) -> Tensor:
-        """How far its place and size are, [N] in [0, 1]: also what a silhouette showed from its edge."""
-        return ramp(self.frames, DOUBTED, TRUSTED)
+        """How far its place and size are, [N] in [0, 1]."""
+        return ramp(self.shape, *KEPT)
+
+    @property
+    def source(self) -> Tensor:
+        """How far others may be told by its colour, [N] in [0, 1]: only what was seen squarely, and often."""
+        return ramp(self.seen, *TELLS)
 
     @property
     def together(self) -> Tensor:
@@ -75,10 +89,16 @@ class Evidence:
         return Evidence(
             seen=torch.maximum(self.seen, other.seen),
             frames=torch.maximum(self.frames, other.frames),
+            shape=torch.maximum(self.shape, other.shape),
             facing=torch.maximum(self.facing, other.facing),
             color=share * self.color + (1 - share) * other.color,
             normals=self.normals,
         )
+
+
+def covering(decoded: Decoded) -> Decoded:
+    """What was decoded with no Gaussian smaller than at first, when neighbours cover the surface."""
+    return dataclasses.replace(decoded, log_scale=decoded.log_scale.clamp_min(0))
 
 
 def ramp(values: Tensor, low: float, high: float) -> Tensor:
@@ -91,7 +111,7 @@ def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -
     """The evidence that frames give of a surface's Gaussians.
 
     Args:
-        shown: for each frame the avatar in its pose, N Gaussians, and the frame, on the avatar's device.
+        shown: for each frame the avatar in its pose, N Gaussians that cover, and the frame, on its device.
         surface: that carries the Gaussians.
 
     Raises:
@@ -105,18 +125,19 @@ def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -
         count += 1
     if not sums:
         raise ValueError("evidence needs at least one frame")
-    seen, frames, facing, color, normals = sums
+    seen, frames, shape, facing, color, normals = sums
     return Evidence(
         seen=seen / count,
         frames=frames / count,
+        shape=shape / count,
         facing=facing / frames.clamp_min(1e-12),
-        color=color / seen.clamp_min(1e-12)[:, None],
+        color=color / frames.clamp_min(1e-12)[:, None],
         normals=normals / count,
     )
 
 
 def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Tensor, ...]:
-    """One frame's part in the sums of ``Evidence``: three of [N], colour times seen and normals, [N, 3].
+    """One frame's part in the sums of ``Evidence``: four of [N], colour times share and normals, [N, 3].
 
     The blending weights come from the renderer's own backward pass: the derivative of
     ``sum(rendering * picture)`` with respect to a Gaussian's colour is the sum of the pixels that it covers,
@@ -128,16 +149,19 @@ def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Ten
     towards = torch.nn.functional.normalize(view.camera.centre.to(means) - means, dim=1)
     cosine = (normals * towards).sum(1).clamp(0, 1)
     weighed = dataclasses.replace(gaussians, colors=gaussians.colors.detach().clone().requires_grad_())
-    image = render(weighed, view.camera).color
+    rendering = render(weighed, view.camera)
+    image = rendering.color
     counts = ramp(view.alpha, *PERSON)[..., None]
     if view.trust is not None:
         counts = counts * (view.trust >= LEAST_TRUST)[..., None]
     color = torch.autograd.grad((image * view.color * counts).sum(), weighed.colors, retain_graph=True)[0]
     weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, 0]
-    share = weight / covered.clamp_min(SMALLEST)
-    showed = ramp(share, HIDDEN, OPEN)
+    covered = covered.clamp_min(SMALLEST)
+    showed = ramp(weight / covered, HIDDEN, OPEN)
+    shape = ramp(rendering.weights.to(weight) / covered, *PROTRUDES)
     seen = showed * ramp(cosine, GRAZING, SQUARE)
-    return seen, showed, showed * cosine, color / weight.clamp_min(1e-12)[:, None] * seen[:, None], normals
+    mean = color / weight.clamp_min(1e-12)[:, None]
+    return seen, showed, shape, showed * cosine, mean * showed[:, None], normals
 
 
 def covered_pixels(

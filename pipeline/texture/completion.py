@@ -44,6 +44,7 @@ def complete_colors(
     color: np.ndarray,  # [N, 3]
     trust: np.ndarray,  # [N]
     normals: np.ndarray | None = None,  # [N, 3]
+    telling: np.ndarray | None = None,  # [N]
 ) -> np.ndarray:
     """A colour for every vertex: [N, 3] float64 in [0, 1].
 
@@ -53,10 +54,12 @@ def complete_colors(
         trust: in [0, 1].
         normals: mean normals in the world over the frames, short where the body turned; light is left out
             of account if None.
+        telling: in [0, 1], how far others may be told by each colour; as far as it is trusted if None.
     """
-    if not (trust > 0).any():
+    telling = trust if telling is None or not (telling > 0).any() else telling
+    if not (telling > 0).any():
         return np.full((len(segments), 3), 0.5)
-    source = spreading(segments, color, trust)
+    source = spreading(segments, color, telling)
     shade = np.ones((len(segments), 1))
     if normals is not None:
         shade = np.exp(shading(color, source, normals, segments.part))[:, None]

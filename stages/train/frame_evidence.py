@@ -9,7 +9,7 @@ import torch
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.avatar.completion import complete_avatar
-from pipeline.avatar.evidence import Evidence, gather_evidence
+from pipeline.avatar.evidence import Evidence, covering, gather_evidence
 from pipeline.clip.frames import spread_from_start
 from pipeline.clip.views import View
 from pipeline.device import moved
@@ -36,7 +36,7 @@ def evidence_of(
         made: generated frames; they are asked for what no captured frame shows.
     """
     with torch.no_grad():
-        decoded = avatar.decode()
+        decoded = covering(avatar.decode())
 
     def shown(frames: tuple[int, ...]) -> Iterator[tuple[Gaussians, View]]:
         for frame in frames:

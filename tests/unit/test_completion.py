@@ -132,7 +132,7 @@ def trained(representation: str) -> Avatar:
 def evidence(trust: torch.Tensor) -> Evidence:
     """Evidence of which trust is 0 or 1, as given."""
     count = len(trust)
-    return Evidence(trust, trust, trust, torch.rand(count, 3), torch.zeros(count, 3))
+    return Evidence(trust, trust, trust, trust, torch.rand(count, 3), torch.zeros(count, 3))
 
 
 @pytest.mark.parametrize("representation", ["bases", "triplane"])

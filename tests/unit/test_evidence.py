@@ -54,9 +54,9 @@ def test_what_lies_behind_another_surface_is_not_known():
     assert (found.trust[:144] == 1).all() and hidden.mean() < 0.02 and hidden.max() < 0.5
 
 
-def test_what_faces_away_has_a_place_and_no_colour():
+def test_what_faces_away_keeps_its_colour_and_tells_no_other():
     found = evidence_of(*sheet(1.0, turned=True))
-    assert (found.trust == 0).all() and (found.shape_trust == 1).all()
+    assert (found.source == 0).all() and (found.trust == 1).all() and (found.shape_trust == 1).all()
 
 
 def test_evidence_does_not_depend_on_how_finely_the_surface_is_divided():
@@ -64,9 +64,9 @@ def test_evidence_does_not_depend_on_how_finely_the_surface_is_divided():
     assert (coarse.trust == 1).all() and (fine.trust == 1).float().mean() > 0.95
 
 
-def test_where_the_mask_is_zero_nothing_is_known():
+def test_where_the_mask_is_zero_a_place_is_known_and_no_colour():
     found = evidence_of(*sheet(1.0), alpha=0.0)
-    assert (found.trust == 0).all() and (found.shape_trust == 0).all() and found.color.isfinite().all()
+    assert (found.trust == 0).all() and (found.shape_trust == 1).all() and found.color.isfinite().all()
 
 
 def test_other_frames_fill_what_these_do_not_show():
