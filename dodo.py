@@ -24,6 +24,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from doit import get_initial_workdir
 from doit.exceptions import InvalidDodoFile, TaskFailed
@@ -59,7 +60,8 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
 
     The NAME=VALUE words are ours; doit itself takes them out of its task names.
     """
-    os.chdir(get_initial_workdir())  # relative paths are meant from where the user stands, also with doit -f
+    # Relative paths are meant from where the user stands, also with doit -f; outside of doit, from here.
+    os.chdir(get_initial_workdir() or Path.cwd())
     try:
         words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         request = parse_request(words)
@@ -80,7 +82,7 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
     return request, chosen
 
 
-def task_words() -> list[tuple[str, str]]:
+def tasks_named() -> list[tuple[str, str]]:
     """The tasks that the command line names: ``fit:oliver`` is ("fit", "oliver")."""
     words = [word.partition(":") for word in sys.argv[1:] if "=" not in word and not word.startswith("-")]
     return [(kind, subject) for kind, _, subject in words]
@@ -89,7 +91,7 @@ def task_words() -> list[tuple[str, str]]:
 def named_subjects(request: Request) -> set[str]:
     """The subjects of the tasks that the command line names."""
     kinds = {*load_stages(request.workspace.stages), *CARE}
-    return {subject for kind, subject in task_words() if kind in kinds and subject and "*" not in subject}
+    return {subject for kind, subject in tasks_named() if kind in kinds and subject and "*" not in subject}
 
 
 def stored_subjects(request: Request) -> tuple[str, ...]:
@@ -99,7 +101,7 @@ def stored_subjects(request: Request) -> tuple[str, ...]:
 
 def kept_subjects(request: Request) -> set[str]:
     """Those of whom only stored results are asked for: to check and delete these no footage is needed."""
-    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in task_words())
+    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in tasks_named())
     return set(stored_subjects(request)) if cares else set()
 
 

@@ -15,8 +15,9 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features, scaled_residual
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, scaled_residual
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.posed import pose_features
 from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded, LinearChange
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms

@@ -99,11 +99,11 @@ def fitting_scale(found: list[Agreement]) -> float | None:
             ratios.append(np.mean([columns.mean(), rows.mean()]) / max(float(trusted.mean()), 1e-6))
     if not ratios:
         return None
-    middle = float(np.median(ratios))
-    best, share = 1.0, 0.0
-    for scale in middle * np.linspace(0.7, 1.4, 29):
-        moved = [share_on(one.points * [scale, scale, 1], one.on_mask) for one in found]
-        here = float(np.nanmedian(moved))
-        if here > share + 1e-9:
-            best, share = float(scale), here
-    return best if share >= _FITS and abs(best - 1) > 0.05 else None
+    scales = float(np.median(ratios)) * np.geomspace(0.5, 2.0, 41)
+    shares = np.array([np.nanmedian([_scaled_share(one, scale) for one in found]) for scale in scales])
+    best = float(np.median(scales[shares >= shares.max() - 0.02]))  # the middle of all that fit as well
+    return best if shares.max() >= _FITS and abs(best - 1) > 0.05 else None
+
+
+def _scaled_share(one: Agreement, scale: float) -> float:
+    return share_on(one.points * np.array([scale, scale, 1]), one.on_mask)

@@ -192,8 +192,8 @@ def _scored(table: dict[str, Any], path: Path) -> list[np.ndarray]:
             raise _refusal(path, "a person without matching 'keypoints' and 'keypoint_scores'")
         return list(points.reshape(-1, *points.shape[-2:]))
     weights = _array(scores, path)
-    if weights.ndim and weights.shape[-1:] == (1,):
-        weights = weights[..., 0]
+    if points.ndim > 1 and weights.size == points[..., 0].size:
+        weights = weights.reshape(points.shape[:-1])
     if points.ndim < 2 or points.shape[:-1] != weights.shape or points.shape[-1] < 2:
         raise _refusal(path, "a person without matching 'keypoints' and 'keypoint_scores'")
     joined = np.concatenate([points[..., :2], weights[..., None]], axis=-1)

@@ -14,6 +14,7 @@ import pytest
 from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import BODY, COUNT, FACE, FEET, LEFT_HAND, RIGHT_HAND, read_keypoints
 from pipeline.clip.records import read_footage
+from pipeline.detection.mediapipe import Estimate
 from pipeline.errors import UserError
 from stages.ingest.keypoint_files import people_in
 from stages.ingest.mask_files import MaskForm, find_form, read_given_mask
@@ -78,8 +79,8 @@ def test_points_that_are_not_the_person_s_are_refused_by_file(folder, change, sa
 
 
 def test_points_of_another_size_are_told_by_their_factor(folder: Path) -> None:
-    write_json(folder / "keypoints", lambda number: (person(number) * [0.5, 0.5, 1]).tolist())
-    with pytest.raises(UserError, match=r"multiplied by (1\.[6-9]|2\.[0-4])"):
+    write_json(folder / "keypoints", lambda number: (scattered(number) * [0.5, 0.5, 1]).tolist())
+    with pytest.raises(UserError, match=r"multiplied by (1\.[7-9]|2\.[0-3])"):
         ingest(folder)
 
 
@@ -94,6 +95,26 @@ def test_of_several_people_the_one_on_the_mask_is_meant(folder: Path) -> None:
     better = np.array(body_points(100.0, 10.0, 0.99))
     write_json(folder / "keypoints", lambda number: [better.tolist(), person(number).tolist()])
     np.testing.assert_allclose(points_of(ingest(folder))[2], person(2), rtol=1e-6)
+
+
+def test_given_points_are_fitted_whoever_gives_the_masks(folder: Path, monkeypatch) -> None:
+    """MediaPipe runs for the masks here, and none of its points is published."""
+    seen = Estimate(
+        pose=np.tile(np.float32([0.5, 0.5, 0, 1]), (33, 1)), world=np.ones((33, 4), np.float32), face=None,
+        hands=(None, None), body_mask=MASKS[0].astype(np.float32) / 255,
+        selfie_mask=MASKS[0].astype(np.float32) / 255,
+    )  # fmt: skip
+    pretend = type("Pretend", (), {"__init__": lambda *_, **__: None, "estimate": lambda *_: seen})
+    nobody = type("Nobody", (), {"__init__": lambda *_: None, "detect": lambda *_: []})
+    monkeypatch.setattr("stages.ingest.detect.Estimator", pretend)
+    monkeypatch.setattr("stages.ingest.people.PersonDetector", nobody)
+    write_json(folder / "keypoints", lambda number: person(0).tolist())
+    given = {"keypoints": str(folder / "keypoints"), "masks": "mediapipe"}
+    context = ingest_context(folder / "run", folder / "clip.mp4", {"mediapipe": folder}, **given)
+    run(context)
+    found = read_keypoints(context.output / "keypoints.parquet")
+    np.testing.assert_allclose(found.whole_body[2], person(0), rtol=1e-6)
+    assert not found.pose_image.any() and not found.face_mesh.any() and not found.hands.any()
 
 
 # Forms.
@@ -234,8 +255,10 @@ def test_unpadded_pictures_keep_their_own_masks(folder: Path) -> None:
 def test_a_file_of_no_picture_is_refused_also_in_a_part_of_the_clip(folder: Path) -> None:
     write_images(folder / "pictures", FRAMES, [f"frame_{k}.png" for k in range(N)])
     write_images(folder / "theirs", MASKS, [f"frame_{k + 1}.png" for k in range(N)])
-    given = {"masks": str(folder / "theirs"), "max_frames": 3}
-    with pytest.raises(UserError, match=r"frame_6\.png .*ingest\.numbered_from"):
+    write_json(folder / "points", lambda number: person(number).tolist(), "frame_{}.json", N + 1)
+    (folder / "points" / "frame_0.json").unlink()
+    given = {"masks": str(folder / "theirs"), "keypoints": str(folder / "points"), "max_frames": 3}
+    with pytest.raises(UserError, match=r"frame_6\.json .*ingest\.numbered_from"):
         ingest(folder, "pictures", **given)
     output = ingest(folder, "pictures", "again", **given, numbered_from=1)
     np.testing.assert_array_equal(read_mask(output / "masks", 0), MASKS[0])

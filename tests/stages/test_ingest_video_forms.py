@@ -18,8 +18,8 @@ from stages.ingest.display_matrix import from_matrix
 from stages.ingest.external_detections import open_sources
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import missing_frames, open_clip, read_clip
-from tests.stages.ingest_clips import (
-    make_context,
+from tests.made.videos import (
+    ingest_context,
     numbered_images,
     walking_blob,
     write_clip,
@@ -261,7 +261,7 @@ def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
         "keypoints": str(write_points(tmp_path / "points", range(12))),
         "masks": str(write_images(tmp_path / "masks", masks)),
     }
-    context = make_context(tmp_path, path, damaged="skip", **given)
+    context = ingest_context(tmp_path, path, damaged="skip", **given)
     shot = open_recording(path, context.settings).shots[0]
     for folder in ("frames", "masks"):
         (context.output / folder).mkdir()

@@ -16,7 +16,7 @@ from pipeline.clip.frames import write_frame, write_mask, write_video
 from pipeline.clip.views import ViewCache
 from stages.evaluate.report.pictures import compare, comparison_sheet
 from stages.fit.overlay import overlays, sheet
-from tests.stages.fit_clip import BODY_FILE
+from tests.made.body import BODY_FILE
 
 SIZES = {0: (48, 64), 1: (40, 72), 2: (56, 60)}  # frame -> width, height
 

@@ -8,11 +8,11 @@ import torch
 from pipeline.avatar.avatar import LARGEST_SCALE
 from pipeline.body import Pose
 from pipeline.numba_kernels import threads
-from tests.unit.test_avatar_representations import a_pose, an_avatar, body, half_gated  # noqa: F401
+from tests.unit.test_avatar_representations import a_pose, an_avatar, half_gated
 
 
 @pytest.fixture
-def split(body):  # noqa: F811
+def split(body):
     """An avatar some of whose scales are clamped, at either end and at the largest scale."""
     avatar = an_avatar(body, "split bases").train()
     log_scale = avatar.representation.log_scale
@@ -87,7 +87,7 @@ def test_bytes_do_not_depend_on_the_number_of_threads(split):
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
-def test_a_body_with_pose_correctives_is_posed_step_by_step(body):  # noqa: F811
+def test_a_body_with_pose_correctives_is_posed_step_by_step(body):
     directions = 1e-3 * torch.randn(*body.v_template.shape, 486, generator=torch.Generator().manual_seed(0))
     avatar = an_avatar(dataclasses.replace(body, pose_directions=directions), "bases").eval()
     bare = an_avatar(body, "bases").eval()
