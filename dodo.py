@@ -36,7 +36,7 @@ from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
-from pipeline.run.effect import check_effect, named_tasks
+from pipeline.run.effect import check_effect, named_tasks, running
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
@@ -140,11 +140,6 @@ def is_current(stage: str, subject: str) -> bool:
         return False
 
 
-def asked_stages() -> list[str]:
-    """The stages that the command line asks for, by name or by leaving all names out."""
-    return [name for word in sys.argv[1:] if (name := word.partition(":")[0]) in STAGES] or DEFAULT
-
-
 @functools.cache
 def compile_once(functions: tuple[str, ...]) -> None:
     """Starts to compile kernels, unless that was done before."""
@@ -157,8 +152,8 @@ def run_stage(stage: str, subject: str) -> TaskFailed | None:
     Beside it, the kernels of the stages after it are compiled where they never were.
     """
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it
-        job = job_of(subject)
-        compile_once(kernels_ahead(job, job.upstream_first(asked_stages()), stage))
+        asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
+        compile_once(kernels_ahead(job_of(subject), asked, stage))
     reason = run_stage_process(stage, subject, REQUEST)
     return TaskFailed(reason) if reason else None
 

@@ -126,8 +126,6 @@ def compile_and_record(function: str) -> None:
 def main(functions: list[str]) -> int:
     """Calls the functions whose record is not there, unless another process is at it; returns 0."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # whoever stops the job wants no traceback of this
-    if hasattr(os, "nice"):
-        os.nice(LOWEST_PRIORITY)
     with contextlib.ExitStack() as stack:
         try:
             cache_folder().mkdir(parents=True, exist_ok=True)
@@ -136,6 +134,8 @@ def main(functions: list[str]) -> int:
             return 0
         from pipeline.run.compile_timer import compile_timer  # numba, for whoever has work
 
+        if hasattr(os, "nice"):
+            os.nice(LOWEST_PRIORITY)
         compiled = stack.enter_context(compile_timer(say))
         for function in functions:
             try:
