@@ -131,7 +131,7 @@ def test_the_truths_mask_on_both_pictures_forgives_and_says_so(clip):
     for one in (strict, kind):
         assert one["psnr_black_own"] == strict["psnr"] and one["psnr_black_truth"] == kind["psnr"]
     named = EvaluateSettings(protocol="paper_black").choices
-    changed = EvaluateSettings(render_mask="truth", refine_test_poses="off").choices
+    changed = EvaluateSettings(render_mask="truth", refine_test_poses="off", edge_colors="photograph").choices
     assert named == changed and named != EvaluateSettings().choices
     assert summary_of(own)["protocol"] != summary_of(both)["protocol"]
 
