@@ -31,8 +31,8 @@ class Projections:
 
     Attributes:
         pixels: [V, S, 2].
-        facing: [V, S] float, 1 where a vertex lies in the picture and faces the camera, ``AWAY`` where it lies
-            in the picture and does not, 0 elsewhere.
+        facing: [V, S] float, 1 where a vertex lies in the picture and faces the camera, ``AWAY`` where it
+            lies in the picture and does not, 0 elsewhere.
     """
 
     pixels: Tensor  # [V, S, 2]
