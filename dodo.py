@@ -18,11 +18,15 @@ What is stale is decided by the store (``pipeline.run.job``), never by doit's ow
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
+from doit import get_initial_workdir
 from doit.exceptions import InvalidDodoFile, TaskFailed
 
 from pipeline.config import assets as third_party
@@ -30,7 +34,9 @@ from pipeline.config.datasets import known_datasets, subjects_of
 from pipeline.config.request import Request, parse_request
 from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
+from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
+from pipeline.run.effect import check_effect, named_tasks, running
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
@@ -38,6 +44,7 @@ from pipeline.store.artifact import Store
 from pipeline.store.verify import verify
 
 DEFAULT_SUBJECT = "smile"
+CARE = ("verify", "prune")  # tasks about stored results
 
 
 def chosen_subjects(request: Request) -> tuple[str, ...]:
@@ -53,23 +60,55 @@ def read_command_line() -> tuple[Request, tuple[str, ...]]:
 
     The NAME=VALUE words are ours; doit itself takes them out of its task names.
     """
+    # Relative paths are meant from where the user stands, also with doit -f; outside of doit, from here.
+    os.chdir(get_initial_workdir() or Path.cwd())
     try:
-        request = parse_request(word for word in sys.argv[1:] if "=" in word and not word.startswith("-"))
+        words = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
+        request = parse_request(words)
         check_settings(request)
         chosen = chosen_subjects(request)
         if request.source and len(chosen) > 1:
             raise UserError("source= names the footage of one subject; run the subjects one by one")
-        for subject in request.subjects:
-            load_subject(request.workspace, subject, request.source, request.dataset)
+        for subject in sorted({*request.subjects, *named_subjects(request)} - kept_subjects(request)):
+            about = request.about(subject)
+            load_subject(request.workspace, subject, about.source, about.dataset)
+        stages = load_stages(request.workspace.stages)
+        tasks = named_tasks(sys.argv[1:], stages)
+        if tasks is not None:
+            names = [word.partition("=")[0] for word in words]
+            check_effect(request, names, tasks, chosen, stages)
     except UserError as error:
         raise InvalidDodoFile(str(error)) from None
     return request, chosen
 
 
+def tasks_named() -> list[tuple[str, str]]:
+    """The tasks that the command line names: ``fit:oliver`` is ("fit", "oliver")."""
+    words = [word.partition(":") for word in sys.argv[1:] if "=" not in word and not word.startswith("-")]
+    return [(kind, subject) for kind, _, subject in words]
+
+
+def named_subjects(request: Request) -> set[str]:
+    """The subjects of the tasks that the command line names."""
+    kinds = {*load_stages(request.workspace.stages), *CARE}
+    return {subject for kind, subject in tasks_named() if kind in kinds and subject and "*" not in subject}
+
+
+def stored_subjects(request: Request) -> tuple[str, ...]:
+    """The subjects that the store holds something of."""
+    return Store(request.workspace.artifacts).subjects(load_stages(request.workspace.stages))
+
+
+def kept_subjects(request: Request) -> set[str]:
+    """Those of whom only stored results are asked for: to check and delete these no footage is needed."""
+    cares = sys.argv[1:2] == ["clean"] or any(kind in CARE for kind, _ in tasks_named())
+    return set(stored_subjects(request)) if cares else set()
+
+
 REQUEST, CHOSEN = read_command_line()
 WORKSPACE = REQUEST.workspace
 STAGES = load_stages(WORKSPACE.stages)
-SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN}))
+SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN, *stored_subjects(REQUEST)}))
 ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
 # "doit clean" deletes what the default tasks made: all of it, also what is only made when asked for.
 DEFAULT = [usual(STAGES)[-1], *(ON_REQUEST if "clean" in sys.argv[1:2] else ())]
@@ -101,8 +140,20 @@ def is_current(stage: str, subject: str) -> bool:
         return False
 
 
+@functools.cache
+def compile_once(functions: tuple[str, ...]) -> None:
+    """Starts to compile kernels, unless that was done before."""
+    start_compiling(functions)
+
+
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
-    """Runs a stage in a process of its own, which writes to this terminal itself."""
+    """Runs a stage in a process of its own, which writes to this terminal itself.
+
+    Beside it, the kernels of the stages after it are compiled where they never were.
+    """
+    with contextlib.suppress(UserError, OSError):  # the stage itself reports it
+        asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
+        compile_once(kernels_ahead(job_of(subject), asked, stage))
     reason = run_stage_process(stage, subject, REQUEST)
     return TaskFailed(reason) if reason else None
 

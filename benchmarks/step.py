@@ -10,15 +10,13 @@ differs is the model's own arithmetic, and Adam's.
 ``train.pose_seen_only``; the others would get no gradient from it. "ours, all" asks them for every Gaussian.
 
 "bases" is the other representation, as many Gaussians with parameters and linear bases of their own, posed
-and regularised in one pass each; "bases, step by step" is its plain twin. They have no equal among the
-others and are compared with each other.
+in one pass; "bases, step by step" is its plain twin. They are compared with each other.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import statistics
 import sys
 
@@ -42,11 +40,11 @@ from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.body import Pose
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over
+from pipeline.device import moved
 from pipeline.metrics import ssim_loss
 from pipeline.splat import Rendering, render
 from stages.train import losses
 from stages.train.body_regions import unmixed
-from stages.train.laplacian_kernel import mean_laplacian
 
 REST = "pose, skin"
 PARTS = ("triplane", "static heads", "pose heads", REST, "render", "losses", "regularisers", "Adam")
@@ -140,8 +138,7 @@ class Contestant:
             self.clock.watch("pose heads", networks.pose_geometry, networks.pose_color)
         self._render = self.clock.timed("render", render)
         self._compare = self.clock.timed("losses", photometric)
-        at_once = isinstance(networks, BasesRepresentation) and model.at_once
-        self._regularise = self.clock.timed("regularisers", functools.partial(regularisers, at_once))
+        self._regularise = self.clock.timed("regularisers", regularisers)
 
     def step(self, frames: list[Frame]) -> Tensor:
         """One optimiser step over the frames; returns the loss. The clock holds what it cost."""
@@ -181,15 +178,13 @@ def photometric(rendering: Rendering, target: Tensor, background: Tensor) -> Ten
     return 0.8 * losses.l1(image, target).mean() + 0.2 * ssim_loss(image, target)
 
 
-def regularisers(at_once: bool, decoded: Decoded, posed: Posed) -> Tensor:
-    """The loss of a posed avatar, roughness and size; roughness in one pass where that is asked for."""
+def regularisers(decoded: Decoded, posed: Posed) -> Tensor:
+    """The loss of a posed avatar, roughness and size."""
     neighbours, colors, pose_offset = decoded.surface.neighbours, posed.gaussians.colors, posed.pose_offset
     assert pose_offset is not None
     same = None if posed.rows is None else unmixed(posed.rows, neighbours, len(colors))
 
     def roughness(values: Tensor, mask: Tensor | None = None) -> Tensor:
-        if at_once:
-            return mean_laplacian(values, neighbours, mask)
         return losses.weighted_mean(losses.laplacian(values, neighbours), mask)
 
     smooth = (
@@ -205,14 +200,16 @@ def regularisers(at_once: bool, decoded: Decoded, posed: Posed) -> Tensor:
 
 @torch.no_grad()
 def frames_of(avatar: Avatar, count: int, size: int) -> list[Frame]:
-    """Random poses and random pictures."""
-    generator, camera, decoded = torch.Generator().manual_seed(2), avatar_camera(size), avatar.decode()
+    """Random poses and random pictures, on the avatar's device."""
+    generator, decoded = torch.Generator().manual_seed(2), avatar.decode()
+    camera = moved(avatar_camera(size), avatar.device)
     frames = []
-    for pose in poses_of(avatar, count):
+    for pose in moved(poses_of(avatar, count), avatar.device):
         target = torch.rand(size, size, 3, generator=generator)
         background = torch.rand(3, generator=generator)
         weights = render(avatar.pose(decoded, pose).gaussians, camera).weights
-        frames.append(Frame(pose, camera, target, background, torch.nonzero(weights)[:, 0]))
+        drawn = moved((target, background), avatar.device)
+        frames.append(Frame(pose, camera, *drawn, torch.nonzero(weights)[:, 0]))
     return frames
 
 

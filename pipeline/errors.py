@@ -17,7 +17,11 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
 # Libraries that write files themselves say it in words of their own.
 FULL_WORDS = re.compile(r"No space left on device|os error 28|errno 28|Disk quota exceeded", re.IGNORECASE)
-MEMORY_WORDS = re.compile(r"can't allocate memory|Cannot allocate memory|out of memory", re.IGNORECASE)
+MEMORY_WORDS = re.compile(
+    r"can't allocate memory|cannot allocate memory|out of memory|failed to map segment|std::bad_alloc"
+    r"|can't start new thread|pthread_create|unable to allocate|insufficient memory",
+    re.IGNORECASE,
+)
 
 
 class UserError(Exception):

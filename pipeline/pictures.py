@@ -23,6 +23,12 @@ def resized(picture: np.ndarray, height: int, enlarge: int = cv2.INTER_CUBIC) ->
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if shrinks else enlarge)
 
 
+def padded(picture: np.ndarray, width: int, height: int, paper: int = 0) -> np.ndarray:
+    """The picture [H, W, 3] in the upper left of one of at least ``width`` x ``height`` pixels."""
+    below, right = max(0, height - picture.shape[0]), max(0, width - picture.shape[1])
+    return np.pad(picture, ((0, below), (0, right), (0, 0)), constant_values=paper)
+
+
 def shrunk(picture: np.ndarray, longest: int) -> np.ndarray:
     """The picture with its longer side at most ``longest`` pixels, its proportions kept."""
     share = min(1.0, longest / max(picture.shape[:2]))

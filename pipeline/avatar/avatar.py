@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import roma
 import torch
 from torch import Tensor, nn
 
@@ -19,6 +18,7 @@ from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.posed import Posed, pose_features, rest_shape
 from pipeline.avatar.representation import Condition, Decoded, LinearChange, Representation
 from pipeline.avatar.residual import regions
 from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
@@ -30,28 +30,6 @@ from pipeline.splat import Gaussians
 
 LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
 LARGEST_SCALE = 0.03  # metres
-
-
-@dataclasses.dataclass(frozen=True)
-class Posed:
-    """One frame's Gaussians and the terms that regularisers look at.
-
-    Attributes:
-        gaussians: in world coordinates.
-        pose_offset: [N, 3], Delta V_pose, metres; None while nothing follows the pose.
-        log_scale: [N, 3], S_tri + Delta S_pose.
-        color_logit: [N, 3], C_tri + Delta C_pose + Delta C_res.
-        color_residual: [N, 3], Delta C_res; None while the residual heads are off.
-        rows: [M] int64, the Gaussians that the pose and residual heads were asked for; None for all. Of
-            the others their parts are zero.
-    """
-
-    gaussians: Gaussians
-    pose_offset: Tensor | None
-    log_scale: Tensor
-    color_logit: Tensor
-    color_residual: Tensor | None = None
-    rows: Tensor | None = None
 
 
 class Avatar(nn.Module):
@@ -272,18 +250,14 @@ class Avatar(nn.Module):
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         condition = Condition(theta, pose.expression, time)
-        # One pass computes on a CPU, for all Gaussians, and knows no pose correctives.
-        if (
-            self.at_once
-            and rows is None
-            and canonical.pose_directions is None
-            and kernels_serve(decoded.offset)
-        ):
+        # One pass computes on a CPU, for all Gaussians, and knows neither pose correctives nor completion.
+        plain = canonical.pose_directions is not None or len(self.completion) > 0 or rows is not None
+        if self.at_once and not plain and kernels_serve(decoded.offset):
             linear = self.representation.linear_change(decoded, condition)
             if linear is not None:
                 return self._pose_at_once(decoded, linear, transforms, pose)
         blended = blend_transforms(transforms, canonical.skinning_weights)
-        shape = decoded.offset + _rest_shape(canonical, pose)
+        shape = decoded.offset + rest_shape(canonical, pose)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
         rest = shape
         change = None
@@ -410,7 +384,7 @@ class Avatar(nn.Module):
         canonical = surface.canonical
         transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
         blended = blend_transforms(transforms, canonical.skinning_weights)
-        shape = _rest_shape(canonical, pose)
+        shape = rest_shape(canonical, pose)
         return Gaussians(
             means=transform_points(blended, shape) + pose.transl,
             quaternions=surface.skinning_tables.place(transforms, shape, pose.transl)[1],
@@ -431,27 +405,6 @@ class Avatar(nn.Module):
         return known[1]
 
 
-def pose_features(rotation: Tensor) -> Tensor:
-    """The pose that heads are conditioned on, ``theta`` without the root.
-
-    Two columns of each joint's rotation matrix, the identity's subtracted, so that the rest pose is
-    zero: [55, 3] rotation vectors -> [54 * 6].
-    """
-    matrices = roma.rotvec_to_rotmat(rotation[1:])
-    return (matrices - torch.eye(3, device=rotation.device))[:, :, :2].reshape(-1)
-
-
 def scaled_residual(answer: Tensor, share: Tensor) -> Tensor:
     """A share, [N, 2], of residual colours and moves: [N, 3] or [N, 6]."""
     return torch.cat([answer[:, :3] * share[:, :1], answer[:, 3:] * share[:, 1:]], 1)
-
-
-def _rest_shape(canonical: Canonical, pose: Pose) -> Tensor:
-    """The vertices before skinning: rest shape, expression and, if the body has them, correctives."""
-    moved = canonical.expression_directions[..., : len(pose.expression)] @ pose.expression
-    shape = canonical.vertices + moved
-    if canonical.pose_directions is None:
-        return shape
-    joints = pose.rotation[1:]
-    matrices = roma.rotvec_to_rotmat(joints) - torch.eye(3, device=joints.device)
-    return shape + canonical.pose_directions @ matrices.reshape(-1)

@@ -15,8 +15,9 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, pose_features, scaled_residual
+from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, scaled_residual
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
+from pipeline.avatar.posed import pose_features
 from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded, LinearChange
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
@@ -93,7 +94,7 @@ class BakedAvatar:
         transforms = joint_transforms(pose.rotation[None], constants.joints, self.parents)[0]
         condition = Condition(theta, pose.expression, time)
         linear = self.representation.linear_change(condition)
-        if linear is not None and not len(constants.correctives):
+        if linear is not None and not len(constants.correctives) and constants.pose_share is None:
             return self._pose_at_once(linear, transforms, pose)
         points = rest = self._rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit

@@ -14,16 +14,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pipeline.avatar.posing_arrays import Frame, Learnt, Pushed, Still
 from pipeline.avatar.representation import LinearChange
-from pipeline.avatar.skinning_kernels import (
-    CHUNKS,
-    Frame,
-    Learnt,
-    Pushed,
-    Still,
-    pose_backward,
-    pose_forward,
-)
+from pipeline.avatar.skinning_kernels import CHUNKS, pose_backward, pose_forward
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.numba_kernels import use_torch_threads
 

@@ -22,6 +22,8 @@ from pipeline.errors import UserError
 
 Item = TypeVar("Item")
 
+_BT709 = 1  # as primaries and as transfer (ISO/IEC 23091-2)
+
 
 def frame_path(folder: Path, index: int) -> Path:
     """The file of frame or mask number ``index``."""
@@ -69,6 +71,8 @@ def write_png(path: Path, image: np.ndarray) -> None:
 def write_video(path: Path, images: Iterable[np.ndarray], fps: float) -> None:
     """Write H.264 in MP4, yuv420p, which every browser plays. Equal input gives equal bytes.
 
+    Colours are converted by BT.709's matrix to limited range, and tagged so: without tags players guess.
+
     Args:
         path: the .mp4 file.
         images: [H, W, 3] uint8 RGB, all of one size; an odd side is padded by one pixel.
@@ -78,6 +82,7 @@ def write_video(path: Path, images: Iterable[np.ndarray], fps: float) -> None:
         ValueError: there are no images, or their sizes differ.
     """
     import av  # loads FFmpeg, which readers of stills do without
+    from av.video.reformatter import ColorRange, Colorspace
 
     rate = Fraction(fps).limit_denominator(1001)
     size: tuple[int, ...] = ()
@@ -92,10 +97,17 @@ def write_video(path: Path, images: Iterable[np.ndarray], fps: float) -> None:
                 size = image.shape
                 stream.height, stream.width = size[0] + size[0] % 2, size[1] + size[1] % 2
                 stream.pix_fmt = "yuv420p"
+                context = stream.codec_context
+                context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
+                context.color_primaries = context.color_trc = _BT709
             if image.shape != size:
                 raise ValueError(f"frames of {size} and {image.shape} cannot share a video")
             even = np.pad(image, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
+            frame = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
+            frame.color_primaries = frame.color_trc = _BT709
+            container.mux(stream.encode(frame))
         if not size:
             raise ValueError(f"{path.name}: no frames to write")
         container.mux(stream.encode())

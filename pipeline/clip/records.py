@@ -19,6 +19,7 @@ import pyarrow as pa
 import torch
 
 from pipeline.clip.camera import Camera
+from pipeline.clip.frame_files import ClipFrames
 from pipeline.errors import UserError
 from pipeline.files.json_files import write_json
 from pipeline.files.tables import read_table, vectors, write_table
@@ -128,6 +129,8 @@ class Footage:
         camera: where the cameras came from (``source``), how far the background moves in a second
             (``displacement``, of the longer side) where it was measured, ``metres_per_unit`` where a scale
             was applied, and what else that source has to say.
+        total: how many frames the source has, whatever was looked at; 0 where it does not say.
+        names: frame number, as text -> file name, of all frames of a source of pictures; empty for a video.
     """
 
     name: str
@@ -142,6 +145,16 @@ class Footage:
     seconds: tuple[float, ...]
     sources: Mapping[str, str]
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    total: int = 0
+    names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def all_frames(self) -> ClipFrames:
+        """All frames of the source, and what they are called."""
+        if self.names:
+            names = {int(frame): name for frame, name in self.names.items()}
+            return ClipFrames(tuple(sorted(names)), names)
+        return ClipFrames(range(self.total))
 
 
 def write_footage(path: Path, footage: Footage) -> None:

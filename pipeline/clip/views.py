@@ -72,12 +72,17 @@ class ViewCache:
 
     def camera(self, frame: int) -> Camera:
         """The camera of a frame's box; the frame itself is not read."""
-        return cropped(self.cameras[frame], self.box)
+        return cropped(self.cameras[frame], self._part(frame))
+
+    def _part(self, frame: int) -> Box | None:
+        """The box within a frame: cameras of one rig may differ in size."""
+        camera = self.cameras[frame]
+        return self.box.clipped(camera.width, camera.height) if self.box else None
 
     def _pictures(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Colours and mask, [H, W, 3] and [H, W] uint8."""
         color, alpha = read_person(self.folder, frame)
-        camera, box = self.cameras[frame], self.box
+        camera, box = self.cameras[frame], self._part(frame)
         if color.shape[:2] != alpha.shape or alpha.shape != (camera.height, camera.width):
             raise UserError(
                 f"{self.folder}: frame, mask and camera {frame} differ in size; run the ingest stage again"

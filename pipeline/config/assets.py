@@ -69,7 +69,7 @@ def load_assets(workspace: Workspace) -> dict[str, Asset]:
     Raises:
         UserError: the file is wrong.
     """
-    path = workspace.data / "assets.toml"
+    path = workspace.definitions("assets.toml")
     assets = {}
     for name, entry in read_toml(path).items():
         try:
@@ -95,7 +95,9 @@ def find_asset(workspace: Workspace, name: str) -> Asset:
     """
     assets = load_assets(workspace)
     if name not in assets:
-        raise UserError(f"{workspace.data / 'assets.toml'}: there is no asset '{name}'{near(name, assets)}")
+        raise UserError(
+            f"{workspace.definitions('assets.toml')}: there is no asset '{name}'{near(name, assets)}"
+        )
     return assets[name]
 
 

@@ -42,3 +42,6 @@ EdgeColors = Literal["own", "photograph"]
 
 ProtocolName = Literal["ours", "paper", "paper_black"]
 """Named sets of the four choices before; see ``pipeline.config.evaluation_protocol``."""
+
+PlyUp = Literal["-y", "y", "z"]
+"""The axis that points up in the world of a .ply for other programs; ours is y."""

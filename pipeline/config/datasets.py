@@ -69,7 +69,7 @@ class Dataset:
 
 def known_datasets(workspace: Workspace) -> tuple[str, ...]:
     """The datasets that data/datasets names, sorted."""
-    return tuple(sorted(path.stem for path in (workspace.data / "datasets").glob("*.toml")))
+    return tuple(sorted(path.stem for path in (workspace.definitions("datasets")).glob("*.toml")))
 
 
 def load_dataset(workspace: Workspace, name: str) -> Dataset:
@@ -78,7 +78,7 @@ def load_dataset(workspace: Workspace, name: str) -> Dataset:
     Raises:
         UserError: there is none, or it is wrong.
     """
-    path = workspace.data / "datasets" / f"{name}.toml"
+    path = workspace.definitions("datasets") / f"{name}.toml"
     known = known_datasets(workspace)
     if name not in known:
         raise UserError(f"dataset={name}: there is only {', '.join(known) or 'none'}{near(name, known)}")
@@ -114,8 +114,10 @@ def subjects_of(workspace: Workspace, name: str) -> tuple[str, ...]:
         UserError: there is no such dataset, or no subject of it.
     """
     load_dataset(workspace, name)
-    files = sorted((workspace.data / "subjects").glob("*.toml"))
+    files = sorted((workspace.definitions("subjects")).glob("*.toml"))
     found = tuple(file.stem for file in files if read_toml(file).get("dataset") == name)
     if not found:
-        raise UserError(f'dataset={name}: no file in {workspace.data / "subjects"} says dataset = "{name}"')
+        raise UserError(
+            f'dataset={name}: no file in {workspace.definitions("subjects")} says dataset = "{name}"'
+        )
     return found

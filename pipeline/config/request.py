@@ -113,13 +113,16 @@ def parse_request(words: Iterable[str] | Mapping[str, str], subject: str = "") -
         subject: who it is about, in place of ``subject=``.
 
     Raises:
-        UserError: a word is not of the form NAME=VALUE, unknown (the near names are shown), empty or wrong.
+        UserError: a word is not of the form NAME=VALUE, unknown (the near names are shown), there twice,
+            empty or wrong.
     """
     pairs = dict(words) if isinstance(words, Mapping) else _pairs(words)
     pairs |= {"subject": subject} if subject else {}
     for name, text in pairs.items():
         if "." not in name and name in (*FIELDS, *PLACES) and not text.strip(" ,"):
             raise UserError(f"{ORIGIN}: {name}= names nothing; leave it out, or say what is meant")
+    if "data" in pairs and not Path(pairs["data"]).is_dir():
+        raise UserError(f"{ORIGIN}: data={pairs['data']} is no folder; make it first, or leave data= out")
     workspace = open_workspace(**{name: pairs[name] for name in PLACES if name in pairs})
     stages = load_stages(workspace.stages)
     pairs = _with_stage_names(pairs, stages)
@@ -139,6 +142,8 @@ def _pairs(words: Iterable[str]) -> dict[str, str]:
         name, equals, value = word.partition("=")
         if not equals:
             raise UserError(f"'{word}' is not of the form NAME=VALUE")
+        if name in pairs:
+            raise UserError(f"{ORIGIN}: {name}= stands twice, {pairs[name]} and {value}: leave one out")
         pairs[name] = value
     return pairs
 

@@ -29,6 +29,7 @@ from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+LONGEST = 100  # letters of a name, which is a folder's
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Subject:
 
 def known_subjects(workspace: Workspace) -> tuple[str, ...]:
     """The subjects that data/subjects names, sorted."""
-    return tuple(sorted(path.stem for path in (workspace.data / "subjects").glob("*.toml")))
+    return tuple(sorted(path.stem for path in (workspace.definitions("subjects")).glob("*.toml")))
 
 
 def load_subject(
@@ -70,8 +71,10 @@ def load_subject(
         UserError: no such subject, or its file is wrong.
     """
     if not NAME.fullmatch(name):
-        raise UserError(f"subject={name}: a name is made of letters, digits, '.', '_' and '-'")
-    path = workspace.data / "subjects" / f"{name}.toml"
+        raise UserError(f"subject={name[:60]}: a name is made of letters, digits, '.', '_' and '-'")
+    if len(name) > LONGEST:
+        raise UserError(f"subject={name[:60]}...: a name has at most {LONGEST} letters, not {len(name)}")
+    path = workspace.definitions("subjects") / f"{name}.toml"
     if not path.is_file():
         if source is None:
             raise UserError(
@@ -128,8 +131,12 @@ def require_footage(workspace: Workspace, subject: Subject) -> Path:
     Raises:
         UserError: it is not there; says what to fetch from where, and names a subject that runs now.
     """
-    if subject.source is not None and subject.source.exists():
+    if subject.source is not None and (subject.source.is_file() or subject.source.is_dir()):
         return subject.source
+    if subject.source is not None and (subject.source.exists() or subject.source.is_symlink()):
+        raise UserError(
+            f"{subject.source} is neither a file nor a folder, or a link to nothing: give a video or a folder"
+        )
     if subject.asset is not None:
         raise UserError(f"{subject.source}: not fetched yet; fetch it: doit run assets:{subject.asset}")
     remedy = (subject.obtain or "name it: source=CLIP.mp4").rstrip(".")

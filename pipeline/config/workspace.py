@@ -6,6 +6,10 @@ import dataclasses
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+"""The checkout, or the folder of the installed package that is laid out like one."""
+
+BUILT_IN = REPOSITORY / "data"
+"""The definitions that come with the project."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,7 +17,8 @@ class Workspace:
     """The folders that a run reads from and writes to.
 
     Attributes:
-        data: the definitions that come with the project (subjects, datasets, presets, assets.toml, body).
+        data: what a user keeps: artifacts and assets where nothing else is said, and own definitions. Its
+            folders subjects, datasets, presets and body and its assets.toml stand for those of the project.
         artifacts: the versioned store.
         assets: what third parties ship, fetched once.
         body_file: the body model; the open body unless the user supplies an SMPL-X file.
@@ -29,7 +34,22 @@ class Workspace:
     @property
     def body(self) -> Path:
         """The folder with the open body and the landmarks of every known body."""
-        return self.data / "body"
+        return self.definitions("body")
+
+    def definitions(self, name: str) -> Path:
+        """A folder or file of definitions: the user's where it is there, else the project's."""
+        return definitions(self.data, name)
+
+
+def definitions(data: Path, name: str) -> Path:
+    """A folder or file of definitions: that of ``data`` where it is there, else the project's."""
+    own = data / name
+    return own if own.exists() else BUILT_IN / name
+
+
+def default_data() -> Path:
+    """The folder that is meant without data=: the checkout's, or ``data`` where the user stands."""
+    return BUILT_IN if (REPOSITORY / "pyproject.toml").is_file() else Path.cwd() / "data"
 
 
 def open_workspace(
@@ -39,12 +59,12 @@ def open_workspace(
     body: str | Path | None = None,
     stages: str = "stages",
 ) -> Workspace:
-    """A workspace with the defaults of this checkout for everything that is not given."""
-    data = Path(data or REPOSITORY / "data").resolve()
+    """A workspace with the defaults for everything that is not given."""
+    data = Path(data or default_data()).resolve()
     return Workspace(
         data=data,
         artifacts=Path(artifacts or data / "artifacts").resolve(),
         assets=Path(assets or data / "assets").resolve(),
-        body_file=Path(body or data / "body" / "open_body.npz").resolve(),
+        body_file=Path(body or definitions(data, "body") / "open_body.npz").resolve(),
         stages=stages,
     )

@@ -1,4 +1,4 @@
-"""Reading a folder of SMPL-X parameters, ``<frame>.json`` each."""
+"""Reading a folder of SMPL-X parameters, a JSON file a frame."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.clip.frame_files import ClipFrames, frame_files
 from pipeline.errors import UserError
 from pipeline.files.text_encoding import decode_text
 from pipeline.pose_files.camera_frame import HAND_JOINTS
@@ -36,6 +37,8 @@ def read_smplx_json(
     frames: Sequence[int],
     hand_mean: Tensor,
     log: Callable[[str], None] = lambda note: None,
+    clip: ClipFrames | None = None,
+    counted_from: int | None = None,
 ) -> InitialPoses:
     """Read the poses of some frames.
 
@@ -43,15 +46,17 @@ def read_smplx_json(
     pose from its neighbours: rotations along the shortest arc, the rest linearly.
 
     Args:
-        folder: holds ``<frame>.json``; leading zeros are allowed, other names are left alone.
+        folder: holds a file a frame, named as ``pipeline.clip.frame_files`` says.
         frames: the T frame numbers, increasing.
         hand_mean: [30, 3], what the hands are relative to, from ``read_hand_mean``.
-        log: told in one line how many frames had to be interpolated.
+        log: told in a line each how files were matched and how many frames had to be interpolated.
+        clip: all frames of the source; None: the names' numbers are frame numbers.
+        counted_from: the first frame's number where the user says so.
 
     Raises:
         UserError: no frame has a usable file, or a file is malformed.
     """
-    known = read_known_poses(folder, frames)
+    known = read_known_poses(folder, frames, clip, counted_from, log)
     if len(known.frames) < len(frames):
         missing = len(frames) - len(known.frames)
         log(f"{folder}: no usable pose of {missing} of {len(frames)} frames, interpolated")
@@ -60,12 +65,20 @@ def read_smplx_json(
     return on_frames(dataclasses.replace(known, rotation=rotation, hands="flat"), frames)
 
 
-def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> InitialPoses:
+def read_known_poses(
+    folder: Path,
+    frames: Sequence[int] | None = None,
+    clip: ClipFrames | None = None,
+    counted_from: int | None = None,
+    log: Callable[[str], None] = lambda note: None,
+) -> InitialPoses:
     """Read the poses that a folder has, with hands relative to the model's mean.
 
     Args:
-        folder: holds ``<frame>.json``; leading zeros are allowed, other names are left alone.
+        folder: holds a file a frame, named as ``pipeline.clip.frame_files`` says.
         frames: the frame numbers that are wanted; all by default.
+        clip, counted_from: as for ``read_smplx_json``.
+        log: told in one line how files were matched, where ``clip`` says of what.
 
     Returns:
         Poses of the frames whose file is usable, float64.
@@ -73,7 +86,7 @@ def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> Initi
     Raises:
         UserError: as ``read_smplx_json``.
     """
-    paths = _by_frame(folder)
+    paths = _by_frame(folder, clip, counted_from, log)
     wanted = list(paths) if frames is None else list(frames)
     read = {frame: _read_frame(paths[frame]) for frame in wanted if frame in paths}
     usable = {frame: values for frame, values in read.items() if values is not None}
@@ -93,16 +106,12 @@ def read_known_poses(folder: Path, frames: Sequence[int] | None = None) -> Initi
     )
 
 
-def _by_frame(folder: Path) -> dict[int, Path]:
+def _by_frame(
+    folder: Path, clip: ClipFrames | None, counted_from: int | None, log: Callable[[str], None]
+) -> dict[int, Path]:
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder: {_REMEDY}")
-    paths: dict[int, Path] = {}
-    for path in sorted(folder.glob("*.json")):
-        if path.stem.isascii() and path.stem.isdigit():
-            if int(path.stem) in paths:
-                raise UserError(f"{path} and {paths[int(path.stem)].name} are of one frame: remove one")
-            paths[int(path.stem)] = path
-    return paths
+    return frame_files(folder, (".json",), clip, counted_from, log)
 
 
 def _read_frame(path: Path) -> dict[str, np.ndarray] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from numba.core import event
 
@@ -16,18 +16,25 @@ from numba.core import event
 class CompileTimer(event.Listener):
     """Adds up what is compiled while it listens; what is read from numba's cache does not count.
 
+    Args:
+        say: told once that numba compiles, when it begins to; nobody if None.
+
     Attributes:
         seconds: of wall-clock time.
         cpu_seconds: of the process's time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+        self._say = say
         self.seconds = self.cpu_seconds = 0.0
         self._depth = 0  # a kernel's callees are compiled within it
 
     def on_start(self, event: event.Event) -> None:
         """A kernel's compilation begins."""
         if self._depth == 0:
+            if self._say is not None:
+                self._say("numba compiles kernels, as after every installation or change of them")
+                self._say = None
             self._wall, self._cpu = time.monotonic(), time.process_time()
         self._depth += 1
 
@@ -40,8 +47,8 @@ class CompileTimer(event.Listener):
 
 
 @contextlib.contextmanager
-def compile_timer() -> Iterator[CompileTimer]:
-    """Listens within this."""
-    timer = CompileTimer()
+def compile_timer(say: Callable[[str], None] | None = None) -> Iterator[CompileTimer]:
+    """Listens within this; ``say`` is told when something is compiled."""
+    timer = CompileTimer(say)
     with event.install_listener("numba:compile", timer):
         yield timer

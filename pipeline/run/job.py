@@ -20,7 +20,7 @@ from pipeline.config.settings import Layer, as_dict, command_line_layer, near, r
 from pipeline.config.subjects import Subject, load_subject, require_footage
 from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
-from pipeline.run.stage import Context, Loan, Stage, load_stages
+from pipeline.run.stage import Context, Loan, Stage, load_stages, upstream_first
 from pipeline.store import digest
 from pipeline.store.artifact import Artifact, Store, clear
 
@@ -152,10 +152,7 @@ class Job:
 
     def upstream_first(self, wanted: Iterable[str]) -> list[str]:
         """Some stages and all that they need, in the order in which they run."""
-        found = set(wanted)
-        for name in reversed(list(self.stages)):
-            found |= set(self.stages[name].needs) if name in found else set()
-        return [name for name in self.stages if name in found]
+        return upstream_first(self.stages, wanted)
 
     def needed_assets(self, name: str) -> list[str]:
         """The assets that a stage needs, its footage's included."""
@@ -194,9 +191,9 @@ def preset_layer(workspace: Workspace, name: str) -> Layer:
 
 def preset_path(workspace: Workspace, name: str) -> Path:
     """A preset's file; UserError where there is none."""
-    path = workspace.data / "presets" / f"{name}.toml"
+    path = workspace.definitions("presets") / f"{name}.toml"
     if not path.is_file():
-        known = sorted(file.stem for file in (workspace.data / "presets").glob("*.toml"))
+        known = sorted(file.stem for file in (workspace.definitions("presets")).glob("*.toml"))
         raise UserError(
             f"preset={name}: there is no such preset; there are {', '.join(known)}{near(name, known)}"
         )

@@ -10,10 +10,11 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from pipeline.config.request import Request
+from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.run.job import Job
 from pipeline.run.stage import usual
@@ -30,7 +31,8 @@ def stage_command(stage: str, subject: str, request: Request) -> list[str]:
     words = request.about(subject).words()
     words.pop("subject", None)
     pairs = [f"{name}={value}" for name, value in words.items()]
-    return [sys.executable, "-m", "pipeline", stage, "--subject", subject, *pairs]
+    # -P: a folder called pipeline where the user stands is not taken for this package.
+    return [sys.executable, "-P", "-m", "pipeline", stage, "--subject", subject, *pairs]
 
 
 def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
@@ -49,11 +51,15 @@ def run_stage_process(stage: str, subject: str, request: Request, log: Path | No
         reason = Path(folder) / "reason"
         environment = {**process_environment(), REASON: str(reason)}
         command = stage_command(stage, subject, request)
-        prepare = functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
         with contextlib.ExitStack() as stack:
             out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
             status = subprocess.run(
-                command, env=environment, stdout=out, stderr=out, check=False, preexec_fn=prepare
+                command,
+                env=environment,
+                stdout=out,
+                stderr=out,
+                check=False,
+                preexec_fn=ending_with_this_process(),
             ).returncode
         said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
     if status < 0:
@@ -72,7 +78,7 @@ def leave_reason(message: str) -> None:
 
 
 def process_environment() -> dict[str, str]:
-    """The environment of a stage's process.
+    """The environment of a stage's process, which finds the packages from wherever the user stands.
 
     The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
     zeroed pages at every step; they must be set before Python starts.
@@ -82,7 +88,8 @@ def process_environment() -> dict[str, str]:
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
     }
-    return {**defaults, **os.environ}
+    places = (str(REPOSITORY), os.environ.get("PYTHONPATH", ""))
+    return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
 
 
 def killed_by(number: int) -> str:
@@ -95,6 +102,11 @@ def killed_by(number: int) -> str:
     if name == " (SIGKILL)":
         likely = ", often the system's when memory runs out: run fewer subjects at once or a smaller preset"
     return f"killed by signal {number}{name}{likely}; the same command goes on from here"
+
+
+def ending_with_this_process() -> Callable[[], None] | None:
+    """The function that a started process calls first, so that it ends with this one; None off Linux."""
+    return functools.partial(_end_with, os.getpid()) if sys.platform == "linux" else None
 
 
 def _end_with(parent: int) -> None:

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import importlib
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +71,13 @@ class Stage:
         on_request: whether it is run only by its name, and is no part of what ``doit run`` does.
         words: settings that may stand on the command line without the stage's name before them.
         loans: what it reads of other subjects.
+        idle: of a settings object, the settings that it cannot use: name -> what to write instead. Naming one
+            on the command line is an error.
+        compile_ahead: ``"module:function"`` that calls the stage's kernels once, so that numba compiles
+            them, see ``pipeline.run.compile_ahead``; empty for none.
 
-    ``assets``, ``reads_source``, ``reads_body`` and ``loans`` may be functions of the settings object, so
-    that a stage asks only for what these settings call for.
+    ``assets``, ``reads_source``, ``reads_body``, ``loans`` and ``compile_ahead`` may be functions of the
+    settings object, so that a stage asks only for what these settings call for.
     """
 
     name: str
@@ -89,6 +93,12 @@ class Stage:
     on_request: bool = False
     words: tuple[str, ...] = ()
     loans: tuple[Loan, ...] | Callable[[Any], tuple[Loan, ...]] = ()
+    idle: Callable[[Any], Mapping[str, str]] | None = None
+    compile_ahead: str | Callable[[Any], str] = ""
+
+    def kernels_of(self, settings: Any) -> str:
+        """The function that compiles the stage's kernels under these settings; empty for none."""
+        return self.compile_ahead(settings) if callable(self.compile_ahead) else self.compile_ahead
 
     def demands(self, settings: Any) -> Demands:
         """What the stage asks for under these settings."""
@@ -139,6 +149,14 @@ def load_stages(package: str = "stages") -> dict[str, Stage]:
             )
         ordered.update((stage.name, stage) for stage in ready)
     return ordered
+
+
+def upstream_first(stages: Mapping[str, Stage], wanted: Iterable[str]) -> list[str]:
+    """Some stages and all that they need, in the order in which they run."""
+    found = set(wanted)
+    for name in reversed(list(stages)):
+        found |= set(stages[name].needs) if name in found else set()
+    return [name for name in stages if name in found]
 
 
 def usual(stages: Mapping[str, Stage]) -> list[str]:

@@ -15,7 +15,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,11 @@ class Store:
     def folder(self, subject: str, stage: str) -> Path:
         """Where the versions of one stage of one subject lie."""
         return self.root / subject / stage
+
+    def subjects(self, stages: Iterable[str]) -> tuple[str, ...]:
+        """The subjects with a folder of any of these stages, sorted."""
+        folders = sorted(self.root.iterdir()) if self.root.is_dir() else []
+        return tuple(one.name for one in folders if any((one / stage).is_dir() for stage in stages))
 
     def find(self, subject: str, stage: str, key: str) -> Artifact | None:
         """The version with this key, or None if it is absent, incomplete or damaged.

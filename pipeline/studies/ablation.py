@@ -164,7 +164,7 @@ def variants_of(base: Base) -> dict[str, Variant]:
 
 def dataset_of(subjects: Sequence[str], request: Request) -> str:
     """The dataset that all subjects belong to; empty if none."""
-    files = [request.workspace.data / "subjects" / f"{subject}.toml" for subject in subjects]
+    files = [request.workspace.definitions("subjects") / f"{subject}.toml" for subject in subjects]
     names = {str(read_toml(file).get("dataset", "")) if file.is_file() else "" for file in files}
     return request.dataset or (names.pop() if len(names) == 1 else "")
 

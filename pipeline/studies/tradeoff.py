@@ -137,7 +137,7 @@ def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Resu
     """The presets that the store holds or half of the budget's rest reaches; the others' expected cost."""
     own = search.results[()]
     results, expected = {}, {}
-    for path in sorted((search.base.request.workspace.data / "presets").glob("*.toml")):
+    for path in sorted((search.base.request.workspace.definitions("presets")).glob("*.toml")):
         base = search.base.under_preset(path.stem)
         expected[path.stem] = expected_cost(search, base.job(), levels)
         seconds = expected[path.stem] * sum(own.seconds.values()) / max(own.training_cost, 1e-9)

@@ -163,7 +163,7 @@ def drawn_frames(
             rendering = render(gaussians, camera)
         timer.note("render")
         if "ply" in settings.outputs and fresh:
-            write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians)
+            write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians, settings.ply_up)
             timer.note("ply")
         if "exr" in settings.outputs:
             layers = exr_layers(gaussians, actor.parts, camera, rendering)

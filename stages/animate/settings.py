@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.config.choices import Up
+from pipeline.config.choices import PlyUp, Up
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
 from stages.animate.motions.source import TURNTABLE, motion_source
@@ -63,6 +63,9 @@ class AnimateSettings:
     )
     up: Up = setting(
         "auto", "the axis that is up in a .bvh or an .npz; auto: the one along which its body stands"
+    )
+    ply_up: PlyUp = setting(
+        "y", "the axis that points up in ply/: y as in cameras.parquet; most viewers show -y upright"
     )
     background: ColorName | HexColor = setting(
         "grey", "behind the video's person; OpenEXR has an alpha instead"

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +22,7 @@ import torch
 from pipeline.body import Poses, read_poses, rest_joints
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.clip.fitted_clip import FittedClip
+from pipeline.clip.frame_files import number_files
 from pipeline.clip.frames import spread_from_start
 from pipeline.clip.keypoints import COUNT
 from pipeline.clip.records import read_cameras
@@ -33,7 +33,6 @@ from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
 from stages.auxiliary.turntable_motion import ID_OFFSET, TurntableMotion
 
 PICTURES = (".png", ".jpg", ".jpeg")
-_NUMBER = re.compile(r"(?:.*\D)?(\d+)")
 _REMEDY = "see docs/auxiliary.md for the layouts that auxiliary.folder may have"
 _LARGEST = 1e6
 
@@ -59,14 +58,10 @@ def read_folder(path: Path, clip: FittedClip, turn: TurntableMotion, body_file: 
 
 def numbered(folder: Path) -> dict[int, Path]:
     """The numbered pictures of a folder, frame number -> file, in order; UserError if there are none."""
-    found: dict[int, Path] = {}
-    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
-        match = _NUMBER.fullmatch(file.stem)
-        if file.suffix.lower() in PICTURES and match:
-            found[int(match.group(1))] = file
+    found = number_files(folder, PICTURES)
     if not found:
         raise UserError(f"{folder} holds no numbered pictures: {_REMEDY}")
-    return dict(sorted(found.items()))
+    return found
 
 
 def _ours(path: Path, frames: Path) -> GeneratorOutput:
@@ -90,10 +85,12 @@ def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Gener
     """The peers' ``_gen`` folder; frames are those with a picture, a pose and a camera, and on the list."""
     files = numbered(frames)
     files = {frame % ID_OFFSET: file for frame, file in files.items()}
-    cameras = {number % ID_OFFSET: file for number, file in _by_number(path / "cam_params").items()}
+    cameras = {
+        number % ID_OFFSET: file for number, file in number_files(path / "cam_params", (".json",)).items()
+    }
     listed = _listed(path / "frame_list_train.txt")
     parameters = path / "smplx_optimized" / "smplx_params"
-    ids = {number % ID_OFFSET: number for number in _by_number(parameters)}
+    ids = {number % ID_OFFSET: number for number in number_files(parameters, (".json",))}
     usable = sorted({*files} & {*cameras} & {*ids} & (listed if listed is not None else {*files}))
     if not usable:
         raise UserError(f"{path}: no frame has a picture, a pose and a camera: {_REMEDY}")
@@ -119,10 +116,10 @@ def _peers(path: Path, frames: Path, clip: FittedClip, body_file: Path) -> Gener
 
 
 def _peer_pictures(path: Path, files: dict[int, Path], usable: list[int]) -> Iterator[GeneratedPicture]:
-    folders = {name: path / name for name in ("masks", "keypoints_whole_body")}
+    folders = (("masks", PICTURES), ("keypoints_whole_body", (".json",)))
     masks, points = (
-        {number % ID_OFFSET: file for number, file in _by_number(folder).items()}
-        for folder in folders.values()
+        {number % ID_OFFSET: file for number, file in number_files(path / name, suffixes).items()}
+        for name, suffixes in folders
     )
     for frame in usable:
         mask = read_grey(masks[frame]) if frame in masks else None
@@ -201,11 +198,6 @@ def _decoded(path: Path, flags: int) -> np.ndarray:
     if image is None:
         raise UserError(f"{path} is not a readable picture: replace it or take it out")
     return image
-
-
-def _by_number(folder: Path) -> dict[int, Path]:
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return {int(match.group(1)): file for file in files if (match := _NUMBER.fullmatch(file.stem))}
 
 
 def _listed(path: Path) -> set[int] | None:

@@ -185,7 +185,7 @@ def evaluate(
     table = score_table([*score(context, clip, methods, scorer, embedder, comparisons), *other_cameras])
     write_scores(context.output / "metrics.parquet", table)
     relaxed = relaxed_gaussians(clip, animate, settings)
-    write_ply(context.output / "avatar.ply", relaxed)
+    write_ply(context.output / "avatar.ply", relaxed, context.settings.ply_up)
     cover = write_pictures(context, avatar, relaxed, comparisons)
     summary = summarise(context, clip, table, scorer, nearest.nearest, refined, gate, second)
     summary["gaussians"] = len(relaxed)

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from pipeline.clip.composite import composite_frame
+from pipeline.clip.frame_files import frame_files
 from pipeline.clip.frames import spread_end_to_end
 from pipeline.detection.mediapipe import Estimator, estimator_scale, resize
 from pipeline.errors import UserError
@@ -33,6 +34,7 @@ from stages.evaluate.settings import EvaluateSettings
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
 
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SHORT_SIDE, LONG_SIDE = 400, 1920  # pixels that the estimator is shown, as by ingest's defaults
 _SEGMENTATIONS = ("body_mask", "selfie_mask")
 _NAMES = {"body_mask": "its pose model's segmentation", "selfie_mask": "its selfie segmentation"}
@@ -88,7 +90,9 @@ def second_mask(context: Context, clip: EvaluatedClip) -> SecondMask:
         with context.progress(len(frames), "second masks") as progress:
             return estimated(estimator, clip, frames, progress.advance)
     folder = Path(settings.second_mask)
-    return SecondMask(clip, {frame: read_given(folder, clip, frame) for frame in frames}, folder.name)
+    files = frame_files(folder, PICTURES, clip.footage.all_frames, log=context.log)
+    masks = {frame: read_given(folder, files.get(frame), clip, frame) for frame in frames}
+    return SecondMask(clip, masks, folder.name)
 
 
 def edge(mask: np.ndarray) -> np.ndarray:
@@ -127,16 +131,15 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     return int(((first > 127) & (second > 127)).sum()) / union if union else 0.0
 
 
-def read_given(folder: Path, clip: EvaluatedClip, frame: int) -> np.ndarray:
-    """A mask that somebody else made, [H, W] uint8.
+def read_given(folder: Path, path: Path | None, clip: EvaluatedClip, frame: int) -> np.ndarray:
+    """A mask that somebody else made, [H, W] uint8; ``path`` is its file in ``folder``.
 
     Raises:
         UserError: there is none, or it has another size than the frame.
     """
-    names = [f"{frame:06d}.png", f"{frame:05d}.png", f"{frame}.png"]
-    path = next((folder / name for name in names if (folder / name).is_file()), None)
     if path is None:
-        raise UserError(f"evaluate.second_mask={folder}: there is no {names[0]} or {names[-1]} in it")
+        names = f"{frame:06d}.png or {frame}.png"
+        raise UserError(f"evaluate.second_mask={folder}: there is no {names} in it, or what stands for it")
     mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE) if path.stat().st_size else None
     expected = clip.mask(frame).shape
     if mask is None or mask.shape != expected:

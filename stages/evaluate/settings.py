@@ -9,7 +9,15 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from pipeline.config import evaluation_protocol as protocols
-from pipeline.config.choices import Background, EdgeColors, LpipsNetwork, ProtocolName, Refinement, RenderMask
+from pipeline.config.choices import (
+    Background,
+    EdgeColors,
+    LpipsNetwork,
+    PlyUp,
+    ProtocolName,
+    Refinement,
+    RenderMask,
+)
 from pipeline.config.evaluation_protocol import Protocol
 from pipeline.config.settings import (
     SETTINGS,
@@ -85,6 +93,7 @@ class EvaluateSettings:
     turntable_width: EvenSide = setting(480, "pixels of the turn")
     turntable_height: EvenSide = setting(640, "pixels of the turn")
     turntable_fps: FrameRate = setting(30.0, "frames a second of the turn, and of the motion")
+    ply_up: PlyUp = setting("-y", "the axis that points up in avatar.ply; most viewers show -y upright")
     arm_angle: Angle = setting(1.0, "how far the arms hang below the T pose in the turn, radians")
     motion_frames: FramesOrNone = setting(
         48, "frames of a motion that was never filmed (arms up, head turned); 0: without it"

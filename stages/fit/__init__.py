@@ -3,9 +3,25 @@
 from pipeline.run.stage import Stage
 from stages.fit.settings import FitSettings
 
+
+def idle(settings: FitSettings) -> dict[str, str]:
+    """The settings that cannot act beside the others, and what to write."""
+    found = {}
+    if not settings.pose_init and not settings.face_init:
+        found["numbered_from"] = "no folder is given: name one as fit.pose_init or fit.face_init"
+    if settings.pose_init and settings.given == "ignore":
+        found["given"] = "fit.pose_init is started from: leave out one of the two"
+    if settings.given == "keep":
+        remedy = "poses that are kept are not fitted: leave out fit.given=keep"
+        found.update(dict.fromkeys(("iterations", "learning_rate", "smoothing_window", "face"), remedy))
+    if not settings.iterations:
+        found["learning_rate"] = "no step is taken: raise fit.iterations"
+    return found
+
+
 STAGE = Stage(
     name="fit",
-    version=7,
+    version=8,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={
@@ -20,4 +36,5 @@ STAGE = Stage(
     },  # fmt: skip
     reads_body=True,
     path_settings=("pose_init", "face_init", "flame_model"),
+    idle=idle,
 )

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Poses, mean_identity, rest_joints
+from pipeline.clip.records import read_footage
 from pipeline.errors import UserError
 from pipeline.pose_files import (
     INITIAL_POSES,
@@ -61,7 +62,9 @@ def given_poses(
         UserError: they cannot be read, or are to be kept and are not there.
     """
     if settings.pose_init:
-        return read_smplx_json(Path(settings.pose_init), frames, read_hand_mean(body_file), log)
+        clip, folder = read_footage(ingest / "footage.json").all_frames, Path(settings.pose_init)
+        hands = read_hand_mean(body_file)
+        return read_smplx_json(folder, frames, hands, log, clip, settings.first_number)
     if settings.given == "ignore":
         return None
     path = ingest / INITIAL_POSES

@@ -12,7 +12,7 @@ import torch
 from pipeline.body import BodyModel, Identity, Poses, draw_mesh, posed_vertices
 from pipeline.clip.camera import Camera
 from pipeline.clip.frames import read_frame, read_mask
-from pipeline.pictures import contact_sheet, resized, side_by_side
+from pipeline.pictures import contact_sheet, padded, resized, side_by_side
 
 SHEET_FRAMES = 6
 _EDGE = (255, 210, 0)  # RGB of the mask's outline
@@ -26,16 +26,21 @@ def overlays(
     frames: Path,
     opacity: float,
 ) -> Iterator[np.ndarray]:
-    """Every frame of the clip with the mesh over it: [H, W, 3] uint8 RGB each.
+    """Every frame of the clip with the mesh over it: [H, W, 3] uint8 RGB each, all of one size.
+
+    Cameras of one rig may differ in size: smaller pictures lie in the upper left of the largest's.
 
     Args:
         frames: the folder of the clip's pictures.
         opacity: of the mesh, 0 to 1.
     """
+    width = max(cameras[frame].width for frame in poses.frames)
+    height = max(cameras[frame].height for frame in poses.frames)
     for frame in poses.frames:
         with torch.no_grad():
             vertices = posed_vertices(body, identity, poses.pose(frame))
-        yield draw_mesh(read_frame(frames, frame), cameras[frame], vertices, body.faces, opacity=opacity)
+        drawn = draw_mesh(read_frame(frames, frame), cameras[frame], vertices, body.faces, opacity=opacity)
+        yield padded(drawn, width, height)
 
 
 def sheet_tile(frame: np.ndarray, mask: np.ndarray, drawn: np.ndarray, height: int = 360) -> np.ndarray:
@@ -56,12 +61,12 @@ def sheet(frames: Path, masks: Path, poses: Poses, drawn: Mapping[int, np.ndarra
 
     Args:
         frames, masks: folders of the clip's pictures.
-        drawn: row -> overlay.
+        drawn: row -> overlay, of at least the frame's size.
     """
     tiles = []
     for row in sorted(drawn):
         number = poses.frames[row]
-        tiles.append(sheet_tile(read_frame(frames, number), read_mask(masks, number), drawn[row]))
-    width = tiles[0].shape[1]  # cameras of one rig may differ in size
-    tiles = [cv2.resize(one, (width, len(one))) if one.shape[1] != width else one for one in tiles]
+        frame = read_frame(frames, number)
+        height, width = frame.shape[:2]
+        tiles.append(sheet_tile(frame, read_mask(masks, number), drawn[row][:height, :width]))
     return contact_sheet(tiles, columns=2)

@@ -13,6 +13,7 @@ from torch import Tensor
 from pipeline.body import BodyModel, Identity, Landmarks, Poses
 from pipeline.clip.camera import Camera
 from pipeline.clip.curves import Curve
+from pipeline.clip.frame_files import ClipFrames
 from pipeline.clip.keypoints import Keypoints
 from pipeline.errors import UserError
 from pipeline.numba_kernels import threads
@@ -63,6 +64,7 @@ def register(
     report: Callable[[str], None] = lambda note: None,
     start: InitialPoses | None = None,
     log: Callable[[str], None] = lambda note: None,
+    source: ClipFrames | None = None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -71,6 +73,7 @@ def register(
         report: called after each step with a note on the loss.
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.
+        source: all frames of the footage, which names of given files mean.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
@@ -80,7 +83,7 @@ def register(
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
     observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
-    target = fit_face(body, landmarks, keypoints, observations, views, settings, log)
+    target = fit_face(body, landmarks, keypoints, observations, views, settings, log, source)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
     spread = spread_matrix(body, observations.points[on_face])

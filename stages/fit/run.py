@@ -92,7 +92,8 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         def report(note: str) -> None:
             progress.advance(1, note)
 
-        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log)
+        source = read_footage(ingest / "footage.json").all_frames
+        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log, source)
     return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
 
 

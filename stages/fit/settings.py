@@ -12,6 +12,7 @@ from pipeline.config.settings import SETTINGS, Count, Fraction, Weight, setting
 Steps = Annotated[int, Field(ge=0, le=1_000_000)]
 Coefficients = Annotated[int, Field(ge=1, le=1000)]
 Factor = Annotated[float, Field(gt=0, le=1000)]
+FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
 Window = Annotated[int, Field(ge=0, le=1001)]
 
 
@@ -43,6 +44,9 @@ class FitSettings:
     pose_init: str = setting(
         "", "folder of SMPLest-X poses, smplx_init/*.json; else the estimator's landmarks"
     )
+    numbered_from: FirstNumber = setting(
+        -1, "the first frame's number in the names of pose_init and face_init; -1: as they say"
+    )
     given: Literal["start", "keep", "ignore"] = setting(
         "start", "poses that came with the dataset: start from them, keep them as they are, ignore"
     )
@@ -63,4 +67,11 @@ class FitSettings:
             raise ValueError(f"fit.smoothing_window must be 0 or odd, from 3, not {window}")
         if self.face == "flame" and not (self.face_init and self.flame_model):
             raise ValueError("fit.face=flame needs fit.face_init and fit.flame_model")
+        if self.face != "flame" and (self.face_init or self.flame_model):
+            raise ValueError("fit.face_init and fit.flame_model are not used: set fit.face=flame")
         return self
+
+    @property
+    def first_number(self) -> int | None:
+        """The first frame's number in the names of given files; None where the names say."""
+        return None if self.numbered_from < 0 else self.numbered_from

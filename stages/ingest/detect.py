@@ -15,15 +15,13 @@ from pipeline.clip.keypoints import BODY, Keypoints, empty_keypoints
 from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
 from pipeline.detection.wholebody import PixelLandmarks, inside_picture, to_keypoints, to_pixels
 from stages.ingest import people
-from stages.ingest.external_detections import (
-    DetectionSources,
-    check_frames,
-    read_given_mask,
-    read_whole_body,
-)
+from stages.ingest.external_detections import DetectionSources, check_frames
+from stages.ingest.keypoint_check import OFF_FRAME, Agreement, check_agreement, choose_person
+from stages.ingest.mask_files import read_given_mask
+from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, SourceFrame, read_clip
+from stages.ingest.video import Clip, SourceFrame, missing_frames, read_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
@@ -31,6 +29,8 @@ if TYPE_CHECKING:
 SEARCHES_A_SECOND = 5  # for people
 NATIVE_LOG = "mediapipe.log"
 BEST_POINTS = 5  # a person is there when this many body points are
+OFF_MASK = "keypoints off the mask"
+MOST_COMPARED = 32  # frames whose masks are kept, to tell how given keypoints fail
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,52 +90,70 @@ class FrameDetector:
         self.estimator = None
         if sources.mediapipe is not None:
             self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG)
+        self.agreements: list[Agreement] = []
 
     def detect_frame(self, picture: SourceFrame) -> FrameDetections | str:
         """The person in a frame, or the reason why the frame is dropped."""
         own = people.subject_region(picture.index, self.people, self.clip.width, self.clip.height)
         estimate = self._estimate(picture, own)
-        whole_body = None
         if self.sources.keypoints is not None:
-            if picture.index not in self.sources.keypoints:
-                return "no keypoint file"
-            whole_body = self._whole_body(picture.index)
-        elif estimate is None:
+            return self._given_person(picture, estimate, own)
+        if estimate is None:
             return "no person found"
-        landmarks = to_pixels(estimate, self.width, self.height) if estimate is not None else None
-        points = self._body_points(landmarks, whole_body)
-        if np.sort(points[:, 2])[-BEST_POINTS:].mean() < self.settings.body_score:
+        landmarks = to_pixels(estimate, self.width, self.height)
+        points = landmarks.pose[:, [0, 1, 3]].copy()
+        points[:, 2] *= inside_picture(points, self.size)
+        if not self._is_somebody(points):
+            return "no person found"
+        masks = self._masks(picture, estimate, own)
+        return masks if isinstance(masks, str) else FrameDetections(landmarks, None, masks)
+
+    def _given_person(
+        self, picture: SourceFrame, estimate: Estimate | None, own: np.ndarray | None
+    ) -> FrameDetections | str:
+        """The person whose given keypoints lie on the mask, without MediaPipe's; or why there is none."""
+        given = self.sources.keypoints
+        assert given is not None
+        if picture.index not in given.files:
+            return "no keypoint file"
+        people = given.people(picture.index, (self.clip.width, self.clip.height))
+        people[..., :2] *= [self.width / self.clip.width, self.height / self.clip.height]
+        people = people[[self._is_somebody(points[BODY]) for points in people]] if len(people) else people
+        if not len(people):
             return "no person found"
         masks = self._masks(picture, estimate, own)
         if isinstance(masks, str):
             return masks
-        if masks[0].mean() < self.settings.mask_area:
-            return "mask too small"
-        return FrameDetections(landmarks, whole_body, masks)
+        found = choose_person(people, masks[0], given.files[picture.index])
+        self.agreements.append(found if len(self.agreements) < MOST_COMPARED else found.without_pictures())
+        if found.share < OFF_FRAME:
+            return OFF_MASK
+        points = found.points
+        points[:, 2] *= inside_picture(points, self.size)
+        points[points[:, 2] <= 0] = 0
+        if not self._is_somebody(points[BODY]):
+            return "no person found"
+        return FrameDetections(None, points, masks)
+
+    def _is_somebody(self, points: np.ndarray) -> bool:
+        """Whether the body's points [N, 3] are scored well enough."""
+        return float(np.sort(points[:, 2])[-BEST_POINTS:].mean()) >= self.settings.body_score
 
     def _estimate(self, picture: SourceFrame, own: np.ndarray | None) -> Estimate | None:
         if self.estimator is None:
             return None
         return self.estimator.estimate(resize(people.hide_others(picture.image, own), self.estimator_scale))
 
-    def _whole_body(self, index: int) -> np.ndarray:
-        assert self.sources.keypoints is not None
-        points = read_whole_body(self.sources.keypoints[index])
-        points[:, :2] *= [self.width / self.clip.width, self.height / self.clip.height]
-        points[:, 2] *= inside_picture(points, self.size)
-        points[points[:, 2] <= 0] = 0
-        return points
-
-    def _body_points(self, landmarks: PixelLandmarks | None, whole_body: np.ndarray | None) -> np.ndarray:
-        """The body's points, [17, 3] or [33, 3], with scores that are 0 outside the picture."""
-        if whole_body is not None:
-            return whole_body[BODY]
-        assert landmarks is not None
-        points = landmarks.pose[:, [0, 1, 3]].copy()
-        points[:, 2] *= inside_picture(points, self.size)
-        return points
-
     def _masks(
+        self, picture: SourceFrame, estimate: Estimate | None, own: np.ndarray | None
+    ) -> tuple[np.ndarray, ...] | str:
+        """The masks of somebody; or the reason why there are none."""
+        masks = self._any_masks(picture, estimate, own)
+        if not isinstance(masks, str) and masks[0].mean() < self.settings.mask_area:
+            return "mask too small"
+        return masks
+
+    def _any_masks(
         self, picture: SourceFrame, estimate: Estimate | None, own: np.ndarray | None
     ) -> tuple[np.ndarray, ...] | str:
         """Another program's mask, or the estimator's two; or the reason why there is none."""
@@ -144,7 +162,7 @@ class FrameDetector:
             file = self.sources.masks.get(picture.index)
             if file is None:
                 return "no mask file"
-            return (read_given_mask(file, *size, self.sources.mask_kind).astype(np.float32) / 255,)
+            return (read_given_mask(file, *size, self.sources.mask_form).astype(np.float32) / 255,)
         if estimate is None:
             return "no person found"
         both = (estimate.body_mask, estimate.selfie_mask)
@@ -164,8 +182,8 @@ def count_people(context: Context, clip: Clip, sources: DetectionSources) -> tup
     every = max(1, round((clip.fps or SEARCHES_A_SECOND) / settings.stride / SEARCHES_A_SECOND))
     found, total = [], 0
     with context.progress(_expected(clip, settings), "people") as progress:
-        for picture in read_clip(clip, settings.stride, settings.max_frames):
-            if total % every == 0:
+        for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
+            if total % every == 0 and not picture.damaged:
                 found.append((picture.index, detector.detect(picture.image)))
             total += 1
             progress.advance()
@@ -183,16 +201,19 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
     """
     settings = context.settings
     everyone, total = count_people(context, clip, sources)
+    sources = with_mask_form(context, clip, sources)
     detector = FrameDetector(context, clip, sources, everyone)
     kept: list[tuple[int, float, FrameDetections]] = []
     dropped: Counter[str] = Counter()
     numbers: set[int] = set()
     with context.progress(total or _expected(clip, settings), "frames") as progress:
-        for picture in read_clip(clip, settings.stride, settings.max_frames):
+        for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
             numbers.add(picture.index)
-            seen = detector.detect_frame(picture)
+            seen = "damaged" if picture.damaged else detector.detect_frame(picture)
             if isinstance(seen, str):
                 dropped[seen] += 1
+                if seen == OFF_MASK:
+                    context.log(f"{detector.agreements[-1].path} lies off the person's mask: frame left out")
             else:
                 image = cv2.resize(
                     picture.image, (detector.width, detector.height), interpolation=cv2.INTER_AREA
@@ -204,9 +225,13 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
                     write_segmentations(raw_masks, picture.index, *seen.masks)
                 kept.append((picture.index, picture.seconds, dataclasses.replace(seen, masks=())))
             progress.advance()
+    if not settings.max_frames:
+        lacking = missing_frames(clip, settings.stride)
+        numbers |= lacking
+        dropped += Counter({"cut off": len(lacking)})
     if settings.stride == 1 and not settings.max_frames:
-        for files in (sources.keypoints, sources.masks):
-            check_frames(files or {}, numbers)
+        check_frames(sources, numbers)
+    check_agreement(detector.agreements)
     seconds, dropped_for = tuple(seconds for _, seconds, _ in kept), dict(sorted(dropped.items()))
     size = (detector.width, detector.height, detector.scale)
     return DetectedClip(_stack(kept, detector), seconds, *size, len(numbers), dropped_for, everyone.count)

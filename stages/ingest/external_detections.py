@@ -1,34 +1,28 @@
-"""Keypoints and masks that another program has made, one file a frame, in place of MediaPipe's.
+"""Where a shot's keypoints and masks come from: MediaPipe, or files that another program has made.
 
-Keypoints: a folder of ``<frame>.json``. A file is either a list of 133 ``[x, y, score]`` in pixels of
-the source (ExAvatar's and FlexiAvatar's ``keypoints_whole_body``) or mmpose's own
-``results_<frame>.json`` with ``instance_info[i].keypoints`` and ``.keypoint_scores``, of which the
-person with the highest mean score is taken.
+What those files hold is in ``keypoint_files`` and ``mask_files``, which frame a file means in
+``pipeline.clip.frame_files``.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
-import cv2
-import numpy as np
-
-from pipeline.clip.keypoints import COUNT
+from pipeline.clip.frame_files import ClipFrames, Match, describe_match, match_files, numbers_in
 from pipeline.errors import UserError
-from pipeline.untrusted import check_picture, parse_json
 from stages.ingest.datasets.recording import Shot
-from stages.ingest.video import PICTURES, numbered_files, trailing_number
+from stages.ingest.keypoint_files import GivenKeypoints, open_keypoints
+from stages.ingest.mask_files import MaskForm, has_own_alpha
+from stages.ingest.video import PICTURES, Clip, clip_frames, read_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
 
-MEDIAPIPE, AUTO = "mediapipe", "auto"
-LARGEST = 1e6  # pixels; beyond it a coordinate is no measurement
-_MOST_BYTES = 16 << 20  # mmpose writes every person of a frame
-_REMEDY = "write it again as 133 [x, y, score] or as mmpose's results"
+Found = TypeVar("Found")
+MEDIAPIPE, AUTO, OWN_ALPHA = "mediapipe", "auto", "the pictures' own alpha"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,17 +31,19 @@ class DetectionSources:
 
     Attributes:
         mediapipe: the asset's folder; None where nothing is asked of it.
-        keypoints: frame number -> JSON file; None where MediaPipe gives the keypoints.
+        keypoints: another program's; None where MediaPipe gives the keypoints.
         masks: frame number -> picture; None where MediaPipe gives the masks.
-        mask_kind: as for :func:`read_given_mask`.
+        mask_kind: the person is ``white``, ``inverted`` (black) or ``nonzero`` in them, as the dataset says.
         names: for ``footage.json``: what ``keypoints`` and ``masks`` came from.
+        mask_form: how the masks are encoded, once they were looked at.
     """
 
     mediapipe: Path | None
-    keypoints: Mapping[int, Path] | None
+    keypoints: GivenKeypoints | None
     masks: Mapping[int, Path] | None
     mask_kind: str = "white"
     names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    mask_form: MaskForm = MaskForm()
 
 
 def open_sources(context: Context, shot: Shot, layout: str, span: range | None = None) -> DetectionSources:
@@ -57,109 +53,108 @@ def open_sources(context: Context, shot: Shot, layout: str, span: range | None =
         context: the stage's.
         shot: the footage and what the dataset brings.
         layout: the dataset's name.
-        span: the frame numbers of this shot, where folders that the settings name are of several.
+        span: the frame numbers of this shot, where there are several; files that the settings name are then
+            numbered as the frames are.
 
     Raises:
-        UserError: a folder is missing, empty or ambiguous, or MediaPipe is needed and not there.
+        UserError: a folder is missing, empty or ambiguous, a file is of no frame, or MediaPipe is needed and
+            not there.
     """
-    files: dict[str, Mapping[int, Path] | None] = {}
-    names, kind = {}, shot.mask_kind
-    for what, suffixes, own in (("keypoints", (".json",), shot.keypoints), ("masks", PICTURES, shot.masks)):
-        setting = getattr(context.settings, what)
-        files[what] = own if setting == AUTO else None
-        names[what] = (MEDIAPIPE if own is None else layout) if setting == AUTO else setting
-        if setting not in (AUTO, MEDIAPIPE):
-            found = _files_of_folder(Path(setting), suffixes, what)
-            files[what] = {frame: file for frame, file in found.items() if span is None or frame in span}
-            kind = "white" if what == "masks" else kind
-    if None not in files.values():
-        return DetectionSources(None, **files, mask_kind=kind, names=names)
-    if MEDIAPIPE not in context.assets:
-        raise UserError("MediaPipe is not in data/assets: fetch it with doit run assets:mediapipe")
-    return DetectionSources(context.assets[MEDIAPIPE], **files, mask_kind=kind, names=names)
+    keypoints, points_of = _keypoints(context, shot, layout, span)
+    masks, kind, masks_of = _masks(context, shot, layout, span)
+    mediapipe = None
+    if keypoints is None or masks is None:
+        if MEDIAPIPE not in context.assets:
+            raise UserError("MediaPipe is not in data/assets: fetch it with doit run assets:mediapipe")
+        mediapipe = context.assets[MEDIAPIPE]
+    if keypoints is not None and mediapipe is not None:
+        context.log("keypoints: as given; MediaPipe gives the masks alone")
+    return DetectionSources(mediapipe, keypoints, masks, kind, {"keypoints": points_of, "masks": masks_of})
 
 
-def _files_of_folder(folder: Path, suffixes: tuple[str, ...], what: str) -> dict[int, Path]:
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder: ingest.{what} must be 'mediapipe' or a folder of files")
-    files = numbered_files(folder, suffixes, trailing_number)
-    if not files:
-        raise UserError(f"{folder} holds no numbered {'/'.join(suffixes)} file: check ingest.{what}")
-    return files
-
-
-def check_frames(files: Mapping[int, Path], frames: set[int]) -> None:
-    """Refuse files, frame number -> path, of which one is of no frame of the clip; UserError names it."""
-    strangers = sorted(set(files) - frames)
-    if strangers:
+def _keypoints(
+    context: Context, shot: Shot, layout: str, span: range | None
+) -> tuple[GivenKeypoints | None, str]:
+    setting = context.settings.keypoints
+    if setting == AUTO and shot.keypoints is not None:
+        return GivenKeypoints(shot.keypoints), layout
+    if setting in (AUTO, MEDIAPIPE):
+        return None, MEDIAPIPE
+    path = Path(setting)
+    if not path.exists():
         raise UserError(
-            f"{files[strangers[0]]} is for frame {strangers[0]}, which the clip does not have "
-            f"({len(strangers)} such files): number the files as the frames, or take them out"
+            f"{path} is not a folder: ingest.keypoints must be 'mediapipe', a folder of files or a file"
         )
+    if span is not None:
+        given, _ = open_keypoints(path, ClipFrames(range(span.stop)), 0)
+        files = {frame: file for frame, file in given.files.items() if frame in span}
+        return dataclasses.replace(given, files=files), setting
+
+    def match(frames: ClipFrames) -> tuple[GivenKeypoints, Match]:
+        return open_keypoints(path, frames, context.settings.first_number)
+
+    return _matched(context, "keypoints", path, shot.clip, match), setting
 
 
-def read_whole_body(path: Path) -> np.ndarray:
-    """One person's 133 points, [133, 3] float32: x, y in source pixels, score clipped to [0, 1].
+def _masks(
+    context: Context, shot: Shot, layout: str, span: range | None
+) -> tuple[Mapping[int, Path] | None, str, str]:
+    setting = context.settings.masks
+    if setting == AUTO and shot.masks is not None:
+        return shot.masks, shot.mask_kind, layout
+    if setting == AUTO and has_own_alpha(shot.clip.pictures):
+        return shot.clip.pictures, "white", OWN_ALPHA
+    if setting in (AUTO, MEDIAPIPE):
+        return None, "white", MEDIAPIPE
+    folder = Path(setting)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder: ingest.masks must be 'mediapipe' or a folder of files")
+    if span is not None:
+        files, _ = match_files(folder, PICTURES, ClipFrames(range(span.stop)), 0)
+        return {frame: file for frame, file in files.items() if frame in span}, "white", setting
 
-    Raises:
-        UserError: not JSON, not 133 points, or a number that is null, not finite or beyond ``LARGEST``.
-    """
-    value = parse_json(path, _REMEDY, _MOST_BYTES)
-    if isinstance(value, dict) and "instance_info" in value:
-        return _best_person(path, value["instance_info"])
-    return _points(path, value)
+    def match(frames: ClipFrames) -> tuple[dict[int, Path], Match]:
+        files, match = match_files(folder, PICTURES, frames, context.settings.first_number)
+        if not files and not match.strangers:
+            raise UserError(f"{folder} holds no numbered {'/'.join(PICTURES)} file: check ingest.masks")
+        return files, match
 
-
-def _best_person(path: Path, people: Any) -> np.ndarray:
-    if not isinstance(people, list) or not all(isinstance(one, dict) for one in people):
-        raise UserError(f"{path}: 'instance_info' is not a list of people: {_REMEDY}")
-    found = [np.zeros((COUNT, 3), np.float32)] if not people else []
-    for one in people:
-        points, scores = one.get("keypoints"), one.get("keypoint_scores")
-        if not isinstance(points, list) or not isinstance(scores, list) or len(points) != len(scores):
-            raise UserError(f"{path}: a person has no matching 'keypoints' and 'keypoint_scores': {_REMEDY}")
-        pairs = zip(points, scores, strict=True)
-        found.append(_points(path, [[*p[:2], s] if isinstance(p, list) else p for p, s in pairs]))
-    return max(found, key=lambda points: float(points[:, 2].mean()))
-
-
-def _points(path: Path, value: Any) -> np.ndarray:
-    try:
-        array = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.zeros(0)
-    if array.shape != (COUNT, 3):
-        raise UserError(f"{path} does not hold {COUNT} points of x, y, score: {_REMEDY}")
-    bad = np.flatnonzero(~(np.abs(array) < LARGEST).all(1))
-    if len(bad):
-        raise UserError(f"{path}: point {bad[0]} is not finite or lies beyond {LARGEST:.0f} px: {_REMEDY}")
-    array[:, 2] = np.clip(array[:, 2], 0, 1)
-    return array.astype(np.float32)
+    return _matched(context, "masks", folder, shot.clip, match), "white", setting
 
 
-def read_given_mask(path: Path, width: int, height: int, kind: str = "white") -> np.ndarray:
-    """A mask file as soft alpha, resized by averaging: [height, width] uint8, 255 where it is the person.
+def _matched(
+    context: Context, what: str, path: Path, clip: Clip, match: Callable[[ClipFrames], tuple[Found, Match]]
+) -> Found:
+    """What ``match`` finds for the frames of a clip, logged; UserError where a file is of no frame."""
+    frames = clip_frames(clip)
+    found, how = match(frames)
+    if not clip.pictures and (how.strangers or not frames.numbers):
+        # Containers may be wrong about how many frames they have, or say nothing.
+        context.log(f"{what}: counting the frames of {clip.path.name}")
+        frames = ClipFrames(range(clip.first, clip.first + sum(1 for _ in read_clip(clip))))
+        found, how = match(frames)
+    if how.strangers:
+        raise _stranger(path, how.strangers, frames, clip)
+    context.log(f"{what}: {describe_match(how, frames)}")
+    return found
 
-    Args:
-        path: a grey picture, or one with transparency, which then is the mask.
-        width, height: of the result, pixels.
-        kind: the person is ``white`` (255 wholly so), ``inverted`` (0 wholly so) or ``nonzero``.
 
-    Raises:
-        UserError: the file is damaged.
-    """
-    data, remedy = np.fromfile(path, np.uint8), "replace it, or set ingest.masks=mediapipe"
-    check_picture(path, remedy, data.tobytes())
-    mask = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    if mask is None:
-        raise UserError(f"{path} is not a readable picture: {remedy}")
-    if mask.ndim == 3:  # a picture with transparency carries the mask there
-        mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(-1)
-    if mask.dtype == np.uint16:
-        mask = mask // 257
-    if kind == "nonzero":
-        mask = (mask > 0).astype(np.uint8) * 255
-    elif kind == "inverted":
-        mask = 255 - mask
-    resized = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    return np.clip(np.round(resized), 0, 255).astype(np.uint8)
+def _stranger(path: Path, strangers: Sequence[str], frames: ClipFrames, clip: Clip) -> UserError:
+    numbers = list(numbers_in(strangers).values())
+    place = path / strangers[0] if path.is_dir() else f"{path}, '{strangers[0]}'"
+    meant = f"is for frame {numbers[0]}, which the clip does not have" if numbers else "is of no frame"
+    return UserError(
+        f"{place} {meant} ({len(strangers)} such; {clip.path.name} has {len(frames.numbers)} frames): "
+        "name the files as the frames, say ingest.numbered_from (the first frame's number), or take them out"
+    )
+
+
+def check_frames(sources: DetectionSources, frames: set[int]) -> None:
+    """Refuse files of which one is of no frame that was read; UserError names it."""
+    for files in (sources.keypoints.files if sources.keypoints else {}, sources.masks or {}):
+        strangers = sorted(set(files) - frames)
+        if strangers:
+            raise UserError(
+                f"{files[strangers[0]]} is for frame {strangers[0]}, which the clip does not have "
+                f"({len(strangers)} such files): number the files as the frames, or take them out"
+            )

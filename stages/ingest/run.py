@@ -38,6 +38,9 @@ def run(context: Context) -> None:
     recording = open_recording(context.source, settings)
     if recording.layout != "plain":
         context.log(describe_layout(recording))
+    for shot in recording.shots:
+        for note in shot.clip.notes:
+            context.log(f"{shot.clip.path.name}: {note}")
     for folder in ("frames", "masks"):
         (output / folder).mkdir(parents=True)
     found = ingest_recording(context, recording)
@@ -50,7 +53,8 @@ def run(context: Context) -> None:
     write_cameras(output / "cameras.parquet", found.cameras)
     write_keypoints(output / "keypoints.parquet", detected.keypoints)
     write_split(output / "split.json", split)
-    write_footage(output / "footage.json", describe(recording, found))
+    whole = settings.stride == 1 and not settings.max_frames
+    write_footage(output / "footage.json", describe(recording, found, whole))
     if found.poses is not None:
         write_initial_poses(output / INITIAL_POSES, found.poses)
     write_preview(output, detected.keypoints)
@@ -73,9 +77,10 @@ def describe_layout(recording: Recording) -> str:
     return f"layout {recording.layout}: {shots}brings {', '.join(brought) or 'footage alone'}{notes}"
 
 
-def describe(recording: Recording, found: Ingested) -> Footage:
-    """The content of ``footage.json``."""
+def describe(recording: Recording, found: Ingested, whole: bool) -> Footage:
+    """The content of ``footage.json``; ``whole``: whether every frame was looked at."""
     clip, detected = recording.shots[0].clip, found.detected
+    pictures = {frame: file for shot in recording.shots for frame, file in shot.clip.pictures.items()}
     return Footage(
         name=clip.path.name,
         width=clip.width,
@@ -89,4 +94,6 @@ def describe(recording: Recording, found: Ingested) -> Footage:
         seconds=tuple(round(seconds, 6) for seconds in detected.seconds),
         sources=dict(found.names),
         camera=found.camera_record,
+        total=len(pictures) or (detected.read if whole else clip.expected),
+        names={str(frame): file.name for frame, file in sorted(pictures.items())},
     )

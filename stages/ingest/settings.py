@@ -27,6 +27,7 @@ LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 """The layouts of ``stages/ingest/datasets``, in the order in which a folder is tried."""
 
 TestFraction = Annotated[float, Field(ge=0, le=0.9)]
+FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
 Focal = Annotated[float, Field(ge=0.1, le=100)]
 UnitScale = Annotated[float, Field(ge=0, le=1e6)]
 EstimatorSide = Annotated[int, Field(ge=128, le=8192)]
@@ -40,12 +41,18 @@ class IngestSettings:
     long_side: Side = setting(512, "pixels; larger footage is stored at this size, smaller footage as it is")
     stride: Count = setting(1, "every stride-th frame is looked at")
     max_frames: CountOrNone = setting(0, "how many frames are looked at, 0 for all")
+    damaged: Literal["refuse", "skip"] = setting(
+        "refuse", "footage that is cut off or damaged: refuse it, or skip the frames that are not whole"
+    )
     layout: Literal["auto", Layout] = setting("auto", "how the source lies on disk: plain, or a dataset's")
     keypoints: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of mmpose/DWPose JSON, one a frame"
     )
     masks: NotEmpty = setting(
         "auto", "auto: the dataset's, else mediapipe; or a folder of grey pictures, white where the person is"
+    )
+    numbered_from: FirstNumber = setting(
+        -1, "the first frame's number in the names of files that are not named as the frames; -1: as they say"
     )
     poses: str = setting("", "file of poses to start from that lies elsewhere than the footage: SHOW's .pkl")
     test_fraction: TestFraction = setting(
@@ -106,6 +113,11 @@ class IngestSettings:
         if self.mannequin:
             check_motion(self.mannequin_motion)
         return self
+
+    @property
+    def first_number(self) -> int | None:
+        """The first frame's number in the names of given files; None where the names say."""
+        return None if self.numbered_from < 0 else self.numbered_from
 
     @property
     def uses_estimator(self) -> bool:

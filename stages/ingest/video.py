@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from fractions import Fraction
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
-import av
 import cv2
 import numpy as np
 
+from pipeline.clip.frame_files import ClipFrames, visible_files
 from pipeline.errors import UserError
-from pipeline.untrusted import check_picture
+from pipeline.untrusted import GIGABYTE, bounded_bytes, check_picture
+from stages.ingest.display_matrix import Orientation
+from stages.ingest.video_file import VideoFile, cut_note, open_video, read_video
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+SKIP = "ingest.damaged=skip"
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-_VIDEO_REMEDY = "give a video that FFmpeg can play, or a folder of pictures"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,11 +27,12 @@ class Clip:
 
     Attributes:
         path: the file or the folder.
-        width, height: pixels, after the rotation flag and with square pixels.
+        width, height: pixels, upright and with square pixels.
         fps: frames a second on average; 0 where there is no clock.
         expected: how many frames the source says it has; 0 where it does not say.
         pictures: frame number -> file, for a folder; empty for a video.
-        turns: by how many quarters, counter-clockwise, the rotation flag turns a video's frames.
+        orientation: how a video's frames are turned and mirrored before they are shown.
+        video: how the file is read, for a video; None for a folder.
         first: the number of a video's first frame.
     """
 
@@ -40,8 +42,14 @@ class Clip:
     fps: float
     expected: int
     pictures: dict[int, Path] = dataclasses.field(default_factory=dict)
-    turns: int = 0
+    orientation: Orientation = Orientation()
+    video: VideoFile | None = None
     first: int = 0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is done with a video's frames, and what is missing; a line each."""
+        return self.video.notes if self.video else ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,50 +57,59 @@ class SourceFrame:
     """One frame of a clip.
 
     Attributes:
-        index: the frame's number: its place in decoding order, or the number that names a picture.
+        index: the frame's number: its place in the order in which frames are shown, or the number that names
+            a picture.
         seconds: its time from the clip's first frame; with no clock, its place.
-        image: [H, W, 3] uint8 RGB, upright.
+        image: [H, W, 3] uint8 RGB, upright; black where the frame is damaged.
+        damaged: whether the frame cannot be read, or only with errors.
     """
 
     index: int
     seconds: float
     image: np.ndarray
+    damaged: bool = False
 
 
 def open_clip(path: Path) -> Clip:
-    """Look at the first frame of a source.
+    """Look at the first frames of a source.
 
     Raises:
         UserError: nothing there, no video stream, no frame, or no readable picture.
     """
-    if not path.exists():
-        raise UserError(f"{path} does not exist: give a video file or a folder of pictures")
     if path.is_dir():
         return _open_folder(path)
-    with _open(path) as container:
-        stream = container.streams.video[0]
-        first = next(_decode(path, container), None)
-        if first is None:
-            raise UserError(f"{path} has a video stream without a single frame: {_VIDEO_REMEDY}")
-        height, width = _upright(first, stream.sample_aspect_ratio).shape[:2]
-        fps = float(stream.average_rate or stream.guessed_rate or 0)
-        seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-        expected = stream.frames or round(seconds * fps)
-        return Clip(path, width, height, fps, expected, turns=_turns(first))
+    if not path.exists():
+        raise UserError(f"{path} does not exist: give a video file or a folder of pictures")
+    video = open_video(path)
+    size = (video.width, video.height)
+    return Clip(path, *size, video.fps, video.expected, orientation=video.orientation, video=video)
 
 
-def read_clip(clip: Clip, stride: int = 1, limit: int = 0) -> Iterator[SourceFrame]:
+def read_clip(
+    clip: Clip, stride: int = 1, limit: int = 0, damaged: Literal["refuse", "skip"] = "refuse"
+) -> Iterator[SourceFrame]:
     """Every ``stride``-th frame in order, at most ``limit`` of them (0: all), one in memory at a time.
 
     Times are a video's own time stamps, so a variable frame rate needs no resampling.
 
+    Args:
+        damaged: ``refuse`` raises where a frame is damaged, and before the first one where a file is cut off
+            and all of it is asked for; ``skip`` yields damaged frames marked as such.
+
     Raises:
         UserError: a frame is damaged, or its size differs from the first one's.
     """
-    frames = _read_folder(clip, stride) if clip.pictures else _read_video(clip, stride)
+    content = clip.video.content if clip.video else None
+    if content and content.cut_off and damaged == "refuse":
+        if not limit or stride * limit > content.held:
+            raise UserError(f"{clip.path} {cut_note(content)}; copy it again, or take what is whole: {SKIP}")
+    frames = _read_folder(clip, stride, damaged) if clip.pictures else _read_video(clip, stride)
     for count, picture in enumerate(frames):
         if limit and count == limit:
             return
+        if picture.damaged and damaged == "refuse":
+            place = clip.pictures.get(picture.index, f"{clip.path}: frame {picture.index}")
+            raise UserError(f"{place} is damaged: replace it, or leave out what is damaged: {SKIP}")
         if picture.image.shape[:2] != (clip.height, clip.width):
             height, width = picture.image.shape[:2]
             place = clip.pictures.get(picture.index, f"{clip.path}, frame {picture.index},")
@@ -102,64 +119,36 @@ def read_clip(clip: Clip, stride: int = 1, limit: int = 0) -> Iterator[SourceFra
         yield picture
 
 
-def _open(path: Path) -> av.container.InputContainer:
-    try:
-        container = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
-        raise UserError(f"{path} is not a video ({error.strerror}): {_VIDEO_REMEDY}") from None
-    if not container.streams.video:
-        container.close()
-        raise UserError(f"{path} has no video stream: {_VIDEO_REMEDY}")
-    return container
-
-
-def _decode(path: Path, container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
-    stream = container.streams.video[0]
-    stream.thread_type = "AUTO"
-    count = 0
-    try:
-        for frame in container.decode(stream):
-            yield frame
-            count += 1
-    except (av.FFmpegError, OSError) as error:
-        remedy = f"cut it there, or set ingest.max_frames={count}" if count else _VIDEO_REMEDY
-        raise UserError(f"{path} is damaged after {count} frames ({error.strerror}): {remedy}") from None
+def missing_frames(clip: Clip, stride: int = 1) -> set[int]:
+    """The numbers of the frames that a video's container states and that are missing, every ``stride``-th."""
+    content = clip.video.content if clip.video else None
+    places = range(content.held, content.stated) if content else ()
+    return {clip.first + place for place in places if place % stride == 0}
 
 
 def _read_video(clip: Clip, stride: int) -> Iterator[SourceFrame]:
-    start = 0.0
-    with _open(clip.path) as container:
-        ratio = container.streams.video[0].sample_aspect_ratio
-        for index, frame in enumerate(_decode(clip.path, container)):
-            time = frame.time if frame.time is not None else index / (clip.fps or 1.0)
-            start = time if index == 0 else start
-            if index % stride == 0:
-                yield SourceFrame(clip.first + index, time - start, _upright(frame, ratio))
-
-
-def _upright(frame: av.VideoFrame, ratio: Fraction | None) -> np.ndarray:
-    """The frame with square pixels, turned by its rotation flag: [H, W, 3] uint8 RGB."""
-    image: np.ndarray = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-    stretch = float(ratio) if ratio else 1.0
-    if stretch > 0 and abs(stretch - 1) > 1e-3:
-        size = (max(1, round(image.shape[1] * stretch)), image.shape[0])
-        image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
-    turns = _turns(frame)
-    return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
-
-
-def _turns(frame: av.VideoFrame) -> int:
-    """The rotation flag in quarters of a turn, counter-clockwise."""
-    return round(frame.rotation / 90) % 4
+    assert clip.video is not None
+    nothing = np.zeros((clip.height, clip.width, 3), np.uint8)
+    for place, seconds, image in read_video(clip.video, stride):
+        whole = image is not None
+        yield SourceFrame(clip.first + place, seconds, image if whole else nothing, not whole)
 
 
 def _open_folder(path: Path) -> Clip:
-    files = _visible_files(path, PICTURES)
+    files = visible_files(path, PICTURES)
     if not files:
         raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): give a folder of frames")
-    # A frame's number is its whole name, or else the place in the order of names.
-    by_name = {int(file.stem): file for file in files if file.stem.isdecimal()}
-    pictures = by_name if len(by_name) == len(files) else dict(enumerate(files))
+    # A frame's number is its whole name, or else the place in the natural order of names.
+    stems = [file.stem for file in files]
+    numbered = all(stem.isascii() and stem.isdigit() for stem in stems)
+    pictures: dict[int, Path] = {}
+    names: dict[str | int, Path] = {}
+    for place, file in enumerate(files):
+        name = int(file.stem) if numbered else file.stem
+        if name in names:
+            raise UserError(f"{file} and {names[name].name} have one name: keep one of them")
+        names[name] = file
+        pictures[int(name) if numbered else place] = file
     return folder_clip(path, pictures)
 
 
@@ -176,46 +165,17 @@ def folder_clip(path: Path, pictures: Mapping[int, Path], fps: float = 0.0) -> C
     return Clip(path, width, height, fps, len(ordered), ordered)
 
 
-def last_number(name: str) -> int | None:
-    """The last run of digits in a name; what precedes it is a camera, a take or a word."""
-    digits = re.findall(r"\d+", name)
-    return int(digits[-1]) if digits else None
-
-
-def trailing_number(name: str) -> int | None:
-    """The digits that a name ends with."""
-    match = re.search(r"\d+\Z", name)
-    return int(match.group()) if match else None
-
-
-def numbered_files(
-    folder: Path,
-    suffixes: Sequence[str] = PICTURES,
-    number_of: Callable[[str], int | None] = last_number,
-) -> dict[int, Path]:
-    """Frame number -> file, sorted; names without a number are left out. Empty without such a folder.
-
-    Raises:
-        UserError: two files of one frame.
-    """
-    found: dict[int, Path] = {}
-    for file in _visible_files(folder, suffixes) if folder.is_dir() else []:
-        number = number_of(file.stem)
-        if number in found:
-            raise UserError(f"{file} and {found[number].name} both name frame {number}: keep one")
-        if number is not None:
-            found[number] = file
-    return dict(sorted(found.items()))
-
-
-def _visible_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    files = sorted(folder.iterdir())
-    return [file for file in files if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+def clip_frames(clip: Clip) -> ClipFrames:
+    """The frames of a clip, and what they are called where they are pictures."""
+    if clip.pictures:
+        return ClipFrames(tuple(clip.pictures), {frame: file.name for frame, file in clip.pictures.items()})
+    return ClipFrames(range(clip.first, clip.first + clip.expected))
 
 
 def read_picture(path: Path) -> np.ndarray:
     """A picture file, [H, W, 3] uint8 RGB, upright after its EXIF flag; UserError if it is damaged."""
-    data, remedy = np.fromfile(path, np.uint8), "replace it or take it out of the folder"
+    remedy = f"replace it, take it out of the folder, or leave it out: {SKIP}"
+    data = np.frombuffer(bounded_bytes(path, GIGABYTE, remedy), np.uint8)
     check_picture(path, remedy, data.tobytes())
     image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if image is None:
@@ -223,9 +183,17 @@ def read_picture(path: Path) -> np.ndarray:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def _read_folder(clip: Clip, stride: int) -> Iterator[SourceFrame]:
+def _read_folder(clip: Clip, stride: int, damaged: str) -> Iterator[SourceFrame]:
     begin = next(iter(clip.pictures))
     for place, (index, file) in enumerate(clip.pictures.items()):
         if place % stride == 0:
             seconds = (index - begin) / clip.fps if clip.fps else float(place)
-            yield SourceFrame(index, seconds, read_picture(file))
+            try:
+                picture = read_picture(file)
+            except UserError:
+                if damaged == "refuse":
+                    raise
+                nothing = np.zeros((clip.height, clip.width, 3), np.uint8)
+                yield SourceFrame(index, seconds, nothing, damaged=True)
+                continue
+            yield SourceFrame(index, seconds, picture)

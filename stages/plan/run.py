@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.clip.plan import write_plan
+from pipeline.clip.plan import COUNTED, write_plan
 from pipeline.numba_kernels import threads
 from pipeline.run.stage import Context
 from stages.plan.decide import decide
@@ -19,6 +19,10 @@ def run(context: Context) -> None:
         inputs = read_inputs(context.inputs["ingest"], context.inputs["fit"], context.body_file)
         plan = decide(inputs, context.settings)
     write_plan(context.output / "plan.json", plan)
+    numbers = ("gaussians", *COUNTED)  # what they say matters more than that they are on
+    for effect in numbers:
+        context.log(plan[effect].why)
     for on, word in ((True, "on"), (False, "off")):
-        names = [one.effect.replace("_", " ") for one in plan.decisions if one.on == on]
+        chosen = [one for one in plan.decisions if one.on == on and one.effect not in numbers]
+        names = [one.effect.replace("_", " ") for one in chosen]
         context.log(f"{word}: {', '.join(names) or 'nothing'}")

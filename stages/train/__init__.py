@@ -23,4 +23,7 @@ STAGE = Stage(
     },
     assets=lambda settings: ("lpips",) if settings.lpips else (),
     reads_body=True,
+    compile_ahead=lambda settings: (
+        "" if settings.device == "cuda" else f"stages.train.compile_ahead:compile_{settings.representation}"
+    ),
 )

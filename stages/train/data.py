@@ -22,6 +22,7 @@ class TrainingData:
         crops: captured frames around the person.
         whole: captured frames, uncropped.
         generated: frames that a model made of sides the camera never saw, if there are any.
+        drawn: the captured frames that are drawn; all of the split's if None.
         texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
             no term asks for it.
     """
@@ -30,12 +31,14 @@ class TrainingData:
     crops: ViewCache
     whole: ViewCache
     generated: GeneratedFrames | None = None
+    drawn: tuple[int, ...] | None = None
     texture: Tensor | None = None  # [N, 3]
 
     @property
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The captured and the generated frames, drawn as ``train.generated_every`` says."""
-        return self.clip.split.train, self.generated.frames if self.generated else ()
+        captured = self.clip.split.train if self.drawn is None else self.drawn
+        return captured, self.generated.frames if self.generated else ()
 
     @property
     def frames(self) -> tuple[int, ...]:

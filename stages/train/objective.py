@@ -28,7 +28,6 @@ from stages.train import losses, schedule
 from stages.train.body_regions import PartWeights, Regions, find_regions, weighted_by
 from stages.train.data import TrainingData
 from stages.train.frame_visibility_cache import FrameVisibilityCache
-from stages.train.laplacian_kernel import mean_laplacian
 from stages.train.poses import PoseRefinement
 from stages.train.rendered_frame import RenderedFrame, StaticAvatar
 from stages.train.schedule import Draw
@@ -282,7 +281,7 @@ class TrainingObjective:
         for term in terms:
             if not term.takes_part(self.settings, iteration, position, generated):
                 continue
-            mean = _reduced(term, source, self.avatar.architecture.representation == "bases")
+            mean = _reduced(term, source)
             if mean is not None:
                 found[term.name] = term.scalar_weight(self.settings, generated) * mean
         return found
@@ -299,21 +298,13 @@ class TrainingObjective:
         return self._last_regions[1]
 
 
-def _reduced(term: Term[Source], source: Source, at_once: bool) -> Tensor | None:
-    """The mean of a term's loss, weighted by its mask and by body part; None where an operand is missing.
-
-    Args:
-        term: a row of the table.
-        source: of its operands.
-        at_once: Laplacians in one pass. A triplane's are not: its published bytes would change.
-    """
+def _reduced(term: Term[Source], source: Source) -> Tensor | None:
+    """The mean of a term's loss, weighted by its mask and by body part; None where an operand is missing."""
     operands = term.of(source)
     if any(operand is None for operand in operands):
         return None
     weight, mask = source.regions.weights.get(term.name), term.mask(source) if term.mask else None
     if mask is not None:
         weight = mask if weight is None else mask * weight
-    if at_once and term.loss is losses.laplacian:
-        return mean_laplacian(*operands, weight)
     count = term.count(source) if term.count else None
     return losses.weighted_mean(term.loss(*operands), weight, count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from pipeline.run.compile_timer import CompileTimer, compile_timer
 from pipeline.run.stage import Context
 from stages.train.checkpoint import NAME, read_checkpoint, run_key
 from stages.train.data import TrainingData, read_training_data
+from stages.train.frame_choice import frames_to_draw
 from stages.train.held_out import WATCHED, HeldOutCurve
 from stages.train.hooks import Checkpoints, Log, NearestSkinning, ProgressBar
 from stages.train.initial_avatar import initial_avatar
@@ -45,7 +47,7 @@ def run(context: Context) -> None:
         UserError: if the inputs do not go together, or training diverges.
         NotFiniteError: a number of it is not finite; names it, the iteration and the frame.
     """
-    with threads(context.settings.threads), compile_timer() as compiled:
+    with threads(context.settings.threads), compile_timer(context.log) as compiled:
         train_subject(context, compiled)
         context.timing("compile_seconds", compiled.seconds)
         context.timing("compile_cpu_seconds", compiled.cpu_seconds)
@@ -112,6 +114,10 @@ def build_trainer(
     Raises:
         UserError: as of ``initial_avatar``.
     """
+    drawn = frames_to_draw(data, settings.iterations * settings.batch, settings.visits)
+    if len(drawn) < len(data.clip.split.train):
+        log(f"draws the {len(drawn)} most different of {len(data.clip.split.train)} training frames")
+    data = dataclasses.replace(data, drawn=drawn)
     refinement = PoseRefinement(moved(data.poses, device), data.clip.split.train)
     avatar, data = initial_avatar(data, refinement, settings, log)
     hooks: dict[str, Hook] = {}

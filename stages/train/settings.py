@@ -38,6 +38,7 @@ Rings = Annotated[int, Field(ge=0, le=1000)]
 BasesCount = Annotated[int, Field(ge=0, le=256)]
 Pixels = Annotated[int, Field(ge=0, le=8192)]
 EdgePixels = Annotated[float, Field(ge=0, le=1000)]
+Visits = Annotated[float, Field(ge=0, le=1_000_000)]
 Effort = Annotated[float, Field(gt=0, le=1000)]
 
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
@@ -70,6 +71,9 @@ class TrainSettings:
     iterations: CountOrNone = setting(0, "optimiser steps; 0: as many as the plan says")
     effort: Effort = setting(1.0, "times the plan's steps; without effect where iterations is given")
     batch: Batch = setting(1, "frames an optimiser step; they share one decode of the static part")
+    visits: Visits = setting(
+        6.0, "how often a frame is drawn; of a longer clip the most different frames are, 0: all of them"
+    )
     half_precision: bool = setting(
         True, "heads in bfloat16 where the processor multiplies it faster (AVX-512, a GPU)"
     )
@@ -89,8 +93,8 @@ class TrainSettings:
     # smile (65 frames) lost 0.1 dB with 16 of them, carphone (108) gained 0.8 over 8 (docs/results.md).
     bases: BasesCount = setting(
         16,
-        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction that "
-        "the clip does not move in",
+        "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction "
+        "that the clip does not move in",
     )
     edge_pixels: EdgePixels | None = setting(
         None,

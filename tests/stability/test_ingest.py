@@ -19,14 +19,20 @@ from tests.made.videos import body_points, ingest_context, walking_blob, write_i
 
 
 def material(folder, frames, masks, points=None):
-    """A folder of pictures, with masks and keypoints beside it."""
+    """A folder of pictures, with masks and keypoints beside it, which lie on the person."""
     write_images(folder / "clip", frames)
     write_images(folder / "masks", masks)
     (folder / "keypoints").mkdir()
     for number in range(len(frames)):
-        value = points(number) if points else body_points(frames[0].shape[1] / 2, frames[0].shape[0] / 2)
+        value = points(number) if points else body_points(*middle_of(masks[number]))
         (folder / "keypoints" / f"{number}.json").write_text(json.dumps(value))
     return folder
+
+
+def middle_of(mask):
+    """The middle of a mask, or of its picture where it is empty, less half of what the points extend."""
+    rows, columns = np.nonzero(mask if mask.any() else mask == 0)
+    return columns.mean() - 3, rows.mean() - 2
 
 
 def ingest(folder, **settings):

@@ -18,7 +18,7 @@ from pipeline.clip.keypoints import empty_keypoints, read_keypoints
 from pipeline.clip.records import read_cameras, read_footage, write_cameras
 from pipeline.errors import UserError
 from stages.ingest.cameras.background_motion import MOVING
-from stages.ingest.cameras.calibration import CalibratedCamera, frames_by_name, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, frames_of_views, pinhole_lens
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.cameras.distortion import (
     distortion_pixels,
@@ -28,6 +28,7 @@ from stages.ingest.cameras.distortion import (
     without_distortion,
 )
 from stages.ingest.cameras.extrinsics import FACING, interpolate_gaps, to_upright_world
+from stages.ingest.display_matrix import Orientation
 from stages.ingest.run import run
 from stages.ingest.video import Clip
 from tests.made.room import (
@@ -279,7 +280,7 @@ def test_a_lens_is_turned_and_scaled_with_the_frames(tmp_path: Path) -> None:
     point = rotation.T @ (np.array([0.2, -0.1, 2.0]) - translation)
     x, y = np.asarray(lens.img_from_cam(rotation @ point + translation))
     for turns, expected in ((1, (y, 200 - x)), (3, (100 - y, x))):
-        clip = clip_of(size=(100, 200), turns=turns)
+        clip = clip_of(size=(100, 200), orientation=Orientation(turns))
         view = for_stored_frames(CalibratedCamera(lens, rotation, translation), clip, 50, 100, tmp_path)
         found = view.lens.img_from_cam(view.rotation @ point + view.translation)
         np.testing.assert_allclose(found, np.array(expected) / 2, atol=1e-9)
@@ -333,17 +334,23 @@ def test_a_distorted_model_changes_what_is_published(
 # Numbering, gaps, world
 
 
+def matched(names: list[str], clip: Clip, total: int, path: Path) -> dict[str, int]:
+    view = CalibratedCamera(pinhole_lens(4, 4, (4.0, 4.0), (2.0, 2.0)), np.eye(3), np.zeros(3))
+    given = Calibration(path, "COLMAP", dict.fromkeys(names, view), metric=False, upright=False)
+    return frames_of_views(given, clip, total)[0]
+
+
 def test_names_of_pictures_in_a_folder_win(tmp_path: Path) -> None:
     clip = clip_of(tmp_path, pictures={0: Path("a12.png"), 1: Path("a13.png")})
-    assert frames_by_name(["a13.jpg", "a12.jpg"], clip, 2, tmp_path) == ({"a13.jpg": 1, "a12.jpg": 0}, 0)
+    assert matched(["a13.jpg", "a12.jpg"], clip, 2, tmp_path) == {"a13.jpg": 1, "a12.jpg": 0}
 
 
 def test_numbers_are_believed_where_nobody_knows_the_length(tmp_path: Path) -> None:
-    assert frames_by_name(["x/90.png"], clip_of(), 0, tmp_path) == ({"x/90.png": 90}, 0)
+    assert matched(["x/90.png"], clip_of(), 0, tmp_path) == {"x/90.png": 90}
     with pytest.raises(UserError, match="both name frame 4"):
-        frames_by_name(["a4.png", "b4.png"], clip_of(), 8, tmp_path)
+        matched(["a4.png", "b4.png"], clip_of(), 8, tmp_path)
     with pytest.raises(UserError, match="no frame number"):
-        frames_by_name(["front.png"], clip_of(), 8, tmp_path)
+        matched(["front.png"], clip_of(), 8, tmp_path)
 
 
 def test_short_gaps_are_filled_and_long_ones_are_not() -> None:

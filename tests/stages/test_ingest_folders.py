@@ -192,7 +192,7 @@ def test_numbers_that_are_not_finite(material: Path, number: str) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [[], [[1, 2, 0.5]] * 132, [[1, 2]] * 133, [[1, 2, None]] * 133, [["a", "b", "c"]] * 133, {"people": []},
+    [[], [[1, 2, 0.5]] * 132, [[1, 2]] * 133, [[1, 2, None]] * 133, [["a", "b", "c"]] * 133, {"person": []},
      {"instance_info": 3}, {"instance_info": [{"keypoints": [[1, 2]] * 133}]},
      {"instance_info": [{"keypoints": [[1, 2]] * 20, "keypoint_scores": [1] * 20}]}],
 )  # fmt: skip

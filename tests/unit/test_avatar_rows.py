@@ -8,7 +8,7 @@ import torch
 from pipeline.avatar.sparse import gather_rows, scatter_rows
 from stages.train.body_regions import unmixed
 from stages.train.frame_visibility_cache import FrameVisibilityCache
-from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, body, one_thread  # noqa: F401
+from tests.unit.test_bake import WITH_RESIDUALS, a_pose, an_avatar, one_thread  # noqa: F401
 from tests.unit.test_train_losses import PATH
 
 
@@ -22,7 +22,7 @@ def test_take_and_put_are_indexing_with_gradients():
 
 
 @pytest.mark.parametrize("place", ["canonical", "posed"])
-def test_rows_that_are_asked_for_are_posed_as_ever_and_teach_as_ever(body, place):  # noqa: F811
+def test_rows_that_are_asked_for_are_posed_as_ever_and_teach_as_ever(body, place):
     architecture = dataclasses.replace(WITH_RESIDUALS, residual_place=place, subdivisions=0)
     avatar, rows = an_avatar(body, architecture).train(), torch.arange(1, 2000, 3)
     others = torch.ones(len(avatar), dtype=torch.bool).index_fill(0, rows, False)

@@ -207,7 +207,7 @@ def test_two_files_of_a_frame_and_lengths_that_differ_are_errors(tmp_path):
     with pytest.raises(UserError, match=r"2\.json has 50 numbers in expr, 1\.json 10"):
         read_smplx_json(folder, [1, 2], FLAT)
     write(folder, {"01": parameters()})
-    with pytest.raises(UserError, match=r"of one frame"):
+    with pytest.raises(UserError, match=r"both name frame 1: keep one"):
         read_smplx_json(folder, [1], FLAT)
 
 

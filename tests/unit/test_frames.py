@@ -74,6 +74,35 @@ def test_video_is_h264_that_a_browser_plays(tmp_path: Path) -> None:
     assert data.index(b"moov") < data.index(b"mdat"), "playing should start before the whole file is there"
 
 
+PATCHES = np.array(
+    [(195, 130, 120), (128, 128, 128), (30, 40, 60), (200, 200, 190), (255, 0, 0), (0, 255, 0), (0, 0, 255)]
+)
+
+
+def test_video_is_coded_by_bt709_and_says_so(tmp_path: Path) -> None:
+    """Luma and chroma by the standard's own matrix, limited range, and the tags that players read."""
+    image = np.repeat(np.repeat(PATCHES[None].astype(np.uint8), 32, 0), 32, 1)
+    write_video(tmp_path / "clip.mp4", [image] * 3, 25)
+    with av.open(str(tmp_path / "clip.mp4")) as container:
+        context = container.streams.video[0].codec_context
+        tags = (context.colorspace, context.color_primaries, context.color_trc, context.color_range)
+        frame = next(container.decode(video=0))
+        planes = frame.to_ndarray()  # as they are stored, without a conversion
+    assert tuple(map(int, tags)) == (1, 1, 1, 1)
+    assert (frame.colorspace, frame.color_range) == (1, 1)
+    width = image.shape[1]
+    luma = planes[16, 16::32]
+    blue, red = (planes[row].reshape(-1)[8 : 8 + width // 2 : 16] for row in (32 + 2, 32 + 8 + 2))
+    share = PATCHES / 255
+    expected = share @ [0.2126, 0.7152, 0.0722]
+    assert np.abs(luma - (16 + 219 * expected)).max() <= 2
+    assert np.abs(blue - (128 + 224 * (share[:, 2] - expected) / 1.8556)).max() <= 3
+    assert np.abs(red - (128 + 224 * (share[:, 0] - expected) / 1.5748)).max() <= 3
+    y, cb, cr = (luma - 16) / 219, (blue - 128.0) / 224, (red - 128.0) / 224
+    shown = np.stack([y + 1.5748 * cr, y - 0.187324 * cb - 0.468124 * cr, y + 1.8556 * cb], 1)
+    assert np.abs(255 * shown - PATCHES).max() <= 4
+
+
 def test_equal_images_give_equal_video(tmp_path: Path) -> None:
     images = [noise(32, 48, 3) for _ in range(6)]
     for name in ("a.mp4", "b.mp4"):

@@ -1,4 +1,4 @@
-"""Posing in one pass gives what posing step by step gives, gradients included; so do the Laplacians."""
+"""Posing in one pass gives what posing step by step gives, gradients included."""
 
 import dataclasses
 
@@ -6,17 +6,13 @@ import pytest
 import torch
 
 from pipeline.avatar.avatar import LARGEST_SCALE
-from pipeline.avatar.sparse import SparsePair
 from pipeline.body import Pose
 from pipeline.numba_kernels import threads
-from stages.train import losses
-from stages.train.laplacian_kernel import mean_laplacian
-from tests.unit.test_avatar_representations import a_pose, an_avatar, body, half_gated  # noqa: F401
-from tests.unit.test_train_losses import PATH
+from tests.unit.test_avatar_representations import a_pose, an_avatar, half_gated
 
 
 @pytest.fixture
-def split(body):  # noqa: F811
+def split(body):
     """An avatar some of whose scales are clamped, at either end and at the largest scale."""
     avatar = an_avatar(body, "split bases").train()
     log_scale = avatar.representation.log_scale
@@ -91,38 +87,10 @@ def test_bytes_do_not_depend_on_the_number_of_threads(split):
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
-def test_a_body_with_pose_correctives_is_posed_step_by_step(body):  # noqa: F811
+def test_a_body_with_pose_correctives_is_posed_step_by_step(body):
     directions = 1e-3 * torch.randn(*body.v_template.shape, 486, generator=torch.Generator().manual_seed(0))
     avatar = an_avatar(dataclasses.replace(body, pose_directions=directions), "bases").eval()
     bare = an_avatar(body, "bases").eval()
     with torch.no_grad():
         apart = (avatar.gaussians(a_pose()).means - bare.gaussians(a_pose()).means).norm(dim=1)
     assert float(apart.max()) > 1e-3
-
-
-def a_mesh(count: int = 60) -> SparsePair:
-    """Means over two to five neighbours, not symmetric in their entries; the last two have none."""
-    generator = torch.Generator().manual_seed(1)
-    pairs = torch.randint(0, count - 2, (2, 4 * count), generator=generator)
-    start, end = pairs[:, pairs[0] != pairs[1]].unique(dim=1)
-    degree = torch.bincount(start, minlength=count).float()
-    return SparsePair.build(start, end, 1 / degree[start], (count, count))
-
-
-@pytest.mark.parametrize(("neighbours", "count"), [(PATH, 3), (a_mesh(), 60)])
-@pytest.mark.parametrize("weighted", [True, False])
-def test_mean_laplacian_is_the_weighted_mean_of_laplacians(neighbours, count, weighted):
-    generator = torch.Generator().manual_seed(2)
-    values = torch.randn(count, 3, generator=generator, requires_grad=True)
-    weight = torch.rand(count, 1, generator=generator) if weighted else None
-    fused = mean_laplacian(values, neighbours, weight)
-    plain = losses.weighted_mean(losses.laplacian(values, neighbours), weight)
-    torch.testing.assert_close(fused, plain)
-    mine, theirs = (torch.autograd.grad(3 * one, values)[0] for one in (fused, plain))
-    torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-7)
-
-
-def test_mean_laplacian_of_what_is_not_finite_is_not():
-    values = torch.zeros(3, 3)
-    values[1, 2] = torch.nan
-    assert not bool(mean_laplacian(values, PATH).isfinite())

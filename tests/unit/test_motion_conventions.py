@@ -10,7 +10,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from pipeline.body import JOINT_NAMES, joint_index, load_body, mean_identity
-from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.motion.joint_names import match_joints
 from pipeline.motion.retarget import yaw
@@ -18,7 +17,8 @@ from pipeline.motion.up_axis import AXES, turn_to_y
 from stages.animate.motions.motion import Span
 from stages.animate.motions.read import DrivenPerson, read_motion
 from stages.animate.motions.source import motion_source
-from tests.unit.captured_skeletons import (
+from tests.made.body import BODY_FILE
+from tests.made.captured_skeletons import (
     SKELETONS,
     extra_in,
     random_frames,
@@ -26,9 +26,8 @@ from tests.unit.captured_skeletons import (
     told_by,
     write_captured,
 )
-from tests.unit.motion_files import FPS, made_up
+from tests.made.motions import FPS, made_up
 
-BODY_FILE = REPOSITORY / "data" / "body" / "open_body.npz"
 HEIGHT = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 DRAWN = settings(
     deadline=None, derandomize=True, phases=[Phase.generate]
@@ -345,3 +344,12 @@ def test_joints_are_told_from_where_they_hang_not_only_by_name():
     found = match_joints(names, parents)
     assert found["left_ankle"] == 3 and "left_foot" not in found and "left_wrist" not in found
     assert found["left_shoulder"] == 8 and "left_collar" not in found
+
+
+def test_a_public_z_up_capture_stands(shared_folder, person):
+    path = shared_folder / "cases" / "bvh" / "real_zup_dab.bvh"
+    if not path.is_file():
+        pytest.skip("the public capture is not here")
+    motion = read(path, person)
+    upward = roma.rotvec_to_rotmat(motion.rotation[:, 0].double())[:, 1, 1]
+    assert float(upward.min()) > 0.8 and "Z is up" in motion.notes[0]

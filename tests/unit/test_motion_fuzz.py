@@ -12,15 +12,14 @@ import pytest
 import torch
 
 from pipeline.body import load_body, mean_identity, rest_joints
-from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from stages.animate.motions.motion import Span
 from stages.animate.motions.read import DrivenPerson, read_motion
 from stages.animate.motions.source import MotionSource
-from tests.unit.captured_skeletons import SKELETONS, write_captured
-from tests.unit.motion_files import made_up, write_folder, write_npz
+from tests.made.body import BODY_FILE
+from tests.made.captured_skeletons import SKELETONS, write_captured
+from tests.made.motions import made_up, write_folder, write_npz
 
-BODY_FILE = REPOSITORY / "data" / "body" / "open_body.npz"
 FILES = 400  # of each kind
 MOST_SECONDS = 20.0  # for one file, on a busy machine
 WORDS = (

@@ -10,7 +10,6 @@ import torch
 
 from pipeline.body import load_body, mean_identity, rest_joints
 from pipeline.config.settings import read_toml
-from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.motion.bvh import read_bvh
 from pipeline.untrusted import bounded_bytes, parse_json
@@ -19,10 +18,10 @@ from stages.animate.motions.motion import Span
 from stages.animate.motions.read import DrivenPerson, read_motion
 from stages.animate.motions.source import motion_source
 from stages.animate.settings import AnimateSettings
-from tests.unit.captured_skeletons import SKELETONS, write_captured
-from tests.unit.motion_files import made_up, write_fitted, write_folder
+from tests.made.body import BODY_FILE
+from tests.made.captured_skeletons import SKELETONS, write_captured
+from tests.made.motions import made_up, write_fitted, write_folder
 
-BODY_FILE = REPOSITORY / "data" / "body" / "open_body.npz"
 ENCODINGS = ("utf-8-sig", "utf-16")
 
 

@@ -1,5 +1,7 @@
 """Gaussians to a .ply."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -8,9 +10,11 @@ from pipeline.splat import Gaussians, render, write_ply
 from tests.made.splat_scene import scene
 from tests.ply_reader import read_ply
 
-PROPERTIES = (
-    "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
-)
+PROPERTIES = [
+    *"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2".split(),
+    *(f"f_rest_{k}" for k in range(45)),
+    *"opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split(),
+]
 
 
 def test_the_round_trip_renders_the_same_picture(tmp_path):
@@ -28,12 +32,31 @@ def test_the_file_is_laid_out_as_viewers_expect(tmp_path):
     lines = header.decode().splitlines()
     assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 5"]
     assert lines[3:] == [f"property float {name}" for name in PROPERTIES]
-    first = dict(zip(PROPERTIES, np.frombuffer(body, "<f4")[:17].tolist(), strict=True))
+    first = dict(zip(PROPERTIES, np.frombuffer(body, "<f4")[:62].tolist(), strict=True))
+    assert all(first[f"f_rest_{k}"] == 0 for k in range(45))
     assert first["scale_1"] == pytest.approx(np.log(gaussians.scales[0, 1]))
     assert 1 / (1 + np.exp(-first["opacity"])) == pytest.approx(gaussians.opacities[0].item())
     assert 0.5 + 0.28209479 * first["f_dc_2"] == pytest.approx(gaussians.colors[0, 2].item())
     unit = gaussians.quaternions[0] / gaussians.quaternions[0].norm()
     assert [first[f"rot_{k}"] for k in range(4)] == pytest.approx(unit.tolist())
+
+
+@pytest.mark.parametrize(
+    ("up", "axes"),
+    [("y", [[1, 0, 0], [0, 1, 0], [0, 0, 1]]), ("-y", [[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
+     ("z", [[1, 0, 0], [0, 0, -1], [0, 1, 0]])],
+)  # fmt: skip
+def test_the_world_is_turned_to_the_axis_that_points_up(tmp_path, up, axes):
+    """A camera turned with the world sees the same picture, so means and orientations were turned alike."""
+    gaussians, camera = scene(60, 40, 30, torch.float32)
+    write_ply(tmp_path / "avatar.ply", gaussians, up)
+    again = read_ply(tmp_path / "avatar.ply")
+    turn = torch.tensor(axes, dtype=torch.float32)
+    assert torch.allclose(again.means, gaussians.means @ turn.T, atol=1e-6)
+    sign = {"y": [0, 1, 0], "-y": [0, -1, 0], "z": [0, 0, 1]}[up]
+    assert (turn @ torch.tensor([0.0, 1.0, 0.0])).tolist() == sign
+    seen = dataclasses.replace(camera, rotation=camera.rotation @ turn.T.to(camera.rotation))
+    assert torch.allclose(render(again, seen).color, render(gaussians, camera).color, atol=1e-4)
 
 
 def test_the_ends_of_the_ranges_stay_finite(tmp_path):

@@ -31,7 +31,7 @@ from pipeline.untrusted import (
     read_pickle,
     read_torch,
 )
-from stages.ingest.external_detections import read_given_mask
+from stages.ingest.mask_files import read_given_mask
 from stages.ingest.video import read_picture
 
 REMEDY = "get it again"

@@ -13,7 +13,7 @@ from pipeline.clip.boxes import Box, person_box
 from pipeline.clip.composite import to_bytes
 from pipeline.clip.frames import spread_end_to_end
 from pipeline.orbit_cameras import orbit, visible_extent
-from pipeline.pictures import caption, resized, side_by_side
+from pipeline.pictures import PAPER, caption, padded, resized, side_by_side
 from pipeline.splat import Gaussians, Rendering, render
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import AvatarMethod
@@ -145,11 +145,11 @@ def compare(frame: int, truth: Tensor, render: Tensor, gain: float, psnr: float)
 
 def comparison_sheet(comparisons: Sequence[Comparison], gain: float) -> np.ndarray:
     """``comparison.png``: a row a frame; ground truth, render, error. [H, W, 3] uint8 RGB."""
-    width = comparisons[0].truth.shape[1]
+    width = max(one.truth.shape[1] for one in comparisons)  # cameras of one rig may differ in size
     titles = ("ground truth", "render", f"error x{gain:g}")
     sheet = [side_by_side([caption(title, width) for title in titles], GAP)]
     for one in comparisons:
-        row = side_by_side(one.pictures, GAP)
+        row = side_by_side([padded(picture, width, 0, PAPER) for picture in one.pictures], GAP)
         sheet += [row, caption(f"frame {one.frame}, {one.psnr:.2f} dB", row.shape[1])]
     return np.concatenate(sheet)
 

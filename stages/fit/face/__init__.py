@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from pipeline.body import BodyModel, Landmarks
+from pipeline.clip.frame_files import ClipFrames
 from pipeline.clip.keypoints import Keypoints
 from pipeline.numba_kernels import threads
 from stages.fit.camera_batch import CameraBatch
@@ -34,6 +35,7 @@ def fit_face(
     views: CameraBatch,
     settings: FitSettings,
     log: Callable[[str], None] = lambda line: None,
+    source: ClipFrames | None = None,
 ) -> FaceTarget | None:
     """Fit a face to the clip by the source that ``settings.face`` names.
 
@@ -43,7 +45,8 @@ def fit_face(
         observations: made of the same keypoints; says which face points to trust.
         settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh`` where the
             estimator gave a face mesh.
-        log: told in one line what was fitted, or why nothing was.
+        log: told in a line each what was fitted, or why nothing was, and how files were matched.
+        source: all frames of the footage, which names of files mean; None: their numbers are frame numbers.
 
     Returns:
         None if it is switched off or no face was seen.
@@ -54,12 +57,11 @@ def fit_face(
     if settings.face == "off":
         log("face first: switched off")
         return None
-    if settings.face != "flame" and (settings.face_init or settings.flame_model):
-        log("face first: fit.face_init and fit.flame_model are not used: set fit.face=flame")
     with threads(1), torch.no_grad():
         model = face_model(body, landmarks.face_mesh)
         if settings.face == "flame":
-            parameters = read_flame_parameters(Path(settings.face_init), keypoints.frames)
+            folder, first = Path(settings.face_init), settings.first_number
+            parameters = read_flame_parameters(folder, keypoints.frames, source, first, log)
             from stages.fit.face.from_flame import face_from_flame  # brings trimesh: a second
 
             target = face_from_flame(model, body, load_flame(Path(settings.flame_model)), parameters)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.clip.frame_files import ClipFrames, frame_files
 from pipeline.errors import UserError
 from pipeline.files.text_encoding import decode_text
 
@@ -33,8 +35,14 @@ class FlameParameters:
     valid: Tensor
 
 
-def read_flame_parameters(folder: Path, frames: np.ndarray) -> FlameParameters:
-    """Read ``flame_params/<frame>.json`` of some frames, and ``shape_param.json``.
+def read_flame_parameters(
+    folder: Path,
+    frames: np.ndarray,
+    source: ClipFrames | None = None,
+    counted_from: int | None = None,
+    log: Callable[[str], None] = lambda line: None,
+) -> FlameParameters:
+    """Read ``flame_params/``, a JSON file a frame, of some frames, and ``shape_param.json``.
 
     A frame without a file, or whose ``is_valid`` is false or whose values are null, is not valid. Root,
     neck and eyes are not read: where the head is follows from the registration.
@@ -42,12 +50,16 @@ def read_flame_parameters(folder: Path, frames: np.ndarray) -> FlameParameters:
     Args:
         folder: the ``flame_init`` folder.
         frames: [T], frame numbers of the clip.
+        source: all frames of the footage, which the names mean; None: their numbers are frame numbers.
+        counted_from: the first frame's number where the user says so.
+        log: told in one line how files were matched.
 
     Raises:
         UserError: the folder or the shape is missing, a file is damaged, or no frame has a file.
     """
     shape = _numbers(folder / "shape_param.json", _json(folder / "shape_param.json"))
-    found = [_frame(folder / "flame_params" / f"{frame}.json") for frame in frames.tolist()]
+    files = frame_files(folder / "flame_params", (".json",), source, counted_from, log)
+    found = [_frame(files.get(frame)) for frame in frames.tolist()]
     if all(entry is None for entry in found):
         raise UserError(f"{folder}/flame_params has no file for any frame of the clip: {_REMEDY}")
     known = [entry for entry in found if entry]
@@ -62,9 +74,9 @@ def read_flame_parameters(folder: Path, frames: np.ndarray) -> FlameParameters:
     return FlameParameters(*(torch.from_numpy(a) for a in (shape, expression, jaw, valid)))
 
 
-def _frame(path: Path) -> tuple[np.ndarray, np.ndarray] | tuple[()] | None:
+def _frame(path: Path | None) -> tuple[np.ndarray, np.ndarray] | tuple[()] | None:
     """Expression and jaw; empty where the face was not found, None where there is no file."""
-    if not path.is_file():
+    if path is None:
         return None
     content = _json(path)
     if not isinstance(content, dict) or "expr" not in content or "jaw_pose" not in content:

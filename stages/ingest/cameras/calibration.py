@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from pathlib import Path, PurePath
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from pipeline.clip.frame_files import ClipFrames, describe_match, match_names
 from pipeline.errors import UserError
-from stages.ingest.video import Clip, trailing_number
+from stages.ingest.video import Clip, clip_frames
 
 EVERY_FRAME = ""
 
@@ -41,6 +42,7 @@ class Calibration:
         metric: whether the unit is the metre.
         upright: whether the world's Y axis points up.
         depth: how far the scene's points lie from the cameras, median, in the file's unit; NaN if unknown.
+        by_frame: whether the names are frame numbers.
     """
 
     path: Path
@@ -49,6 +51,7 @@ class Calibration:
     metric: bool
     upright: bool
     depth: float = float("nan")
+    by_frame: bool = False
 
 
 def pinhole_lens(
@@ -65,47 +68,34 @@ def check_rotation(rotation: np.ndarray, where: str) -> None:
         raise UserError(f"{where}: the rotation is not one: write it as a rotation matrix, world-to-camera")
 
 
-def frames_by_name(names: Iterable[str], clip: Clip, total: int, path: Path) -> tuple[dict[str, int], int]:
-    """Picture name -> frame number, and whether the names counted from 0 or 1.
+def frames_of_views(
+    calibration: Calibration, clip: Clip, total: int, counted_from: int | None = None
+) -> tuple[dict[str, int], str]:
+    """Picture name -> frame number, and how they were matched (``pipeline.clip.frame_files``).
 
-    A name that is a picture's own in footage of pictures is that picture. Otherwise the digits that it ends
-    with are a frame's number; where that fits not all names, but one less does, they count from 1 (as FFmpeg
-    numbers the pictures that it writes). A camera of the wrong frame does more harm than none.
+    A camera of the wrong frame does more harm than none, so that every name must be a frame's.
 
     Args:
-        names: as the calibration has them, such as ``image12.jpg``, ``frames/00012.png`` or ``12``.
+        calibration: its names are such as ``image12.jpg``, ``frames/00012.png`` or ``12``.
         clip: the footage.
         total: how many frames a video has; 0 if unknown, and then the numbers are not checked.
-        path: the calibration, for messages.
+        counted_from: the first frame's number where the user says so.
 
     Raises:
         UserError: a name without a number, two names of one frame, or numbers that are no frames'.
     """
-    stems = {name: PurePath(name.replace("\\", "/")).stem for name in names}
-    own = {file.stem: index for index, file in clip.pictures.items()}
-    if own and all(stem in own for stem in stems.values()):
-        return _distinct({name: own[stem] for name, stem in stems.items()}, path), 0
-    numbers: dict[str, int] = {}
-    for name, stem in stems.items():
-        number = trailing_number(stem)
-        if number is None:
-            raise UserError(f"{path}: the picture name '{name}' has no frame number: rename the pictures")
-        numbers[name] = number
-    known = set(clip.pictures) or set(range(total))
-    for first in (0, 1):
-        if not known or all(number - first in known for number in numbers.values()):
-            return _distinct({name: number - first for name, number in numbers.items()}, path), first
-    stranger = next(name for name, number in numbers.items() if number not in known)
-    raise UserError(
-        f"{path}: the picture '{stranger}' is of no frame of {clip.path.name} ({len(known)} frames from "
-        f"{min(known)} to {max(known)}): give the cameras of this clip, numbered as its frames from 0 or 1"
-    )
-
-
-def _distinct(frames: dict[str, int], path: Path) -> dict[str, int]:
-    first: dict[int, str] = {}
-    for name, frame in frames.items():
-        if frame in first:
-            raise UserError(f"{path}: '{first[frame]}' and '{name}' both name frame {frame}: keep one")
-        first[frame] = name
-    return frames
+    path = calibration.path
+    if calibration.by_frame:
+        return {name: int(name) for name in calibration.views}, "by frame number"
+    frames = clip_frames(clip) if clip.pictures else ClipFrames(range(clip.first, clip.first + total))
+    match = match_names(calibration.views, frames, path, counted_from)
+    if match.strangers:
+        raise UserError(
+            f"{path}: the picture '{match.strangers[0]}' is of no frame of {clip.path.name} "
+            f"({len(frames.numbers)} frames; {len(match.strangers)} such names): give this clip's cameras, "
+            "named as its pictures or numbered from 0 or 1, or say ingest.numbered_from"
+        )
+    nameless = [name for name in calibration.views if name not in match.frames]
+    if nameless:
+        raise UserError(f"{path}: the picture name '{nameless[0]}' has no frame number: rename the pictures")
+    return dict(match.frames), describe_match(match, frames)

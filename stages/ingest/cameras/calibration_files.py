@@ -113,7 +113,7 @@ def _read_own(path: Path) -> Calibration:
         views[str(frame)] = CalibratedCamera(lens, camera.rotation.numpy(), camera.translation.numpy())
     if not views:
         raise UserError(f"{path} holds no camera: give another file, or set ingest.cameras=auto")
-    return Calibration(path, "cameras.parquet", views, metric=True, upright=True)
+    return Calibration(path, "cameras.parquet", views, metric=True, upright=True, by_frame=True)
 
 
 def _read_folder(path: Path, clip: Clip) -> Calibration:
@@ -121,7 +121,7 @@ def _read_folder(path: Path, clip: Clip) -> Calibration:
     files = [file for file in sorted(path.glob("*.json")) if not file.name.startswith(".")]
     if not files:
         raise UserError(f"{path} holds neither a COLMAP model nor <frame>.json files: give {_KINDS}")
-    views = {file.stem: _read_json_view(file, clip) for file in files}
+    views = {file.name: _read_json_view(file, clip) for file in files}
     return Calibration(path, "cam_params", views, metric=False, upright=False)
 
 

@@ -20,7 +20,7 @@ from stages.ingest.cameras.calibration import (
     EVERY_FRAME,
     CalibratedCamera,
     Calibration,
-    frames_by_name,
+    frames_of_views,
     pinhole_lens,
 )
 from stages.ingest.cameras.distortion import (
@@ -164,12 +164,13 @@ def _from_calibration(
         name: for_stored_frames(view, clip, detected.width, detected.height, given.path)
         for name, view in given.views.items()
     }
-    first = 0
     if EVERY_FRAME in stored:
         views = dict.fromkeys(frames, stored[EVERY_FRAME])
     else:
         whole = context.settings.stride == 1 and not context.settings.max_frames
-        numbers, first = frames_by_name(stored, clip, detected.read if whole else clip.expected, given.path)
+        total = detected.read if whole else clip.expected
+        numbers, how = frames_of_views(given, clip, total, context.settings.first_number)
+        context.log(f"cameras: {given.path.name}: {how}")
         known = {numbers[name]: view for name, view in stored.items()}
         views = {frame: known[frame] for frame in frames if frame in known}
     if not views:
@@ -186,8 +187,8 @@ def _from_calibration(
     }
     lenses = {f: v.lens for f, v in views.items() if bent[id(v.lens)] > LEFT_ALONE}
     context.log(
-        f"cameras: {given.kind}, {given.path.name}: {len(views)} of {len(frames)} frames"
-        f"{', counted from 1' if first else ''}; {scale.note}; {_distorted(max(bent.values()), bool(lenses))}"
+        f"cameras: {given.kind}, {given.path.name}: {len(views)} of {len(frames)} frames; "
+        f"{scale.note}; {_distorted(max(bent.values()), bool(lenses))}"
     )
     if not given.upright:
         views = _settled(views)

@@ -38,7 +38,9 @@ def for_stored_frames(
     """
     lens = view.lens
     if not _same_shape(lens.width, lens.height, clip) and _same_shape(lens.height, lens.width, clip):
-        view = _turned(view, clip.turns, path)
+        if clip.orientation.mirrored:
+            raise UserError(f"{path} is of the pictures before they were mirrored: calibrate upright ones")
+        view = _turned(view, clip.orientation.turns, path)
         lens = view.lens
     if not _same_shape(lens.width, lens.height, clip):
         raise UserError(

@@ -1,6 +1,6 @@
-"""Calibrated rigs of cameras that stand still: Qualisys and Pose2Sim files.
+"""Calibrated rigs of cameras that stand still: files of Qualisys, and TOML of Pose2Sim, Anipose, Caliscope.
 
-Both have a world whose Z axis points up; here X stays, Y becomes up and Z what was -Y, so that several
+All have a world whose Z axis points up; here X stays, Y becomes up and Z what was -Y, so that several
 cameras of one rig share one world.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,18 @@ def _read_cameras(path: Path) -> dict[str, Any]:
     except (tomllib.TOMLDecodeError, ElementTree.ParseError, ValueError) as error:
         kind = "Pose2Sim" if path.suffix == ".toml" else "Qualisys"
         raise UserError(f"{path} is no {kind} calibration ({error}): export it again") from None
-    known = {key: one for key, one in tables.items() if isinstance(one, dict) and "matrix" in one}
-    return {str(one.get("name", key)): one for key, one in known.items()}
+    return {str(one.get("name", key)): one for key, one in _camera_tables(tables) if not one.get("ignore")}
+
+
+def _camera_tables(tables: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The cameras with their keys: ``[cam_01]``, ``[cameras.0]`` or ``[[cameras]]``."""
+    for key, one in tables.items():
+        if isinstance(one, dict) and "matrix" in one:
+            yield key, one
+        elif isinstance(one, dict):
+            yield from _camera_tables(one)
+        elif isinstance(one, list) and all(isinstance(part, dict) for part in one):
+            yield from _camera_tables({str(place): part for place, part in enumerate(one)})
 
 
 def _qualisys(path: Path, camera: ElementTree.Element) -> Calibration:
@@ -86,10 +97,11 @@ def _qualisys(path: Path, camera: ElementTree.Element) -> Calibration:
 
 
 def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
-    """A camera of Pose2Sim's TOML: size, matrix, distortions, rotation vector, metres."""
+    """A camera of a TOML file: size, matrix, distortions, rotation as a vector or a matrix, metres."""
     try:
         matrix = np.array(table["matrix"], np.float64).reshape(3, 3)
-        turn = np.array(table["rotation"], np.float64).reshape(3)
+        turn = np.array(table["rotation"], np.float64)
+        turn = turn.reshape(3, 3) if turn.size == 9 else cv2.Rodrigues(turn.reshape(3))[0]
         translation = np.array(table["translation"], np.float64).reshape(3)
         bend = np.array(table.get("distortions", [0.0] * 4), np.float64).reshape(-1)
         size = [int(side) for side in np.array(table["size"]).reshape(2)]
@@ -97,11 +109,14 @@ def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
         raise UserError(f"{path}: a camera's table is not complete ({error}): export it again") from None
     if table.get("fisheye"):
         raise UserError(f"{path}: fisheye lenses are not known here: give undistorted footage")
-    if len(bend) > 4 and np.abs(bend[4:]).max() > 0:
-        raise UserError(f"{path}: of the distortions only k1, k2, p1, p2 are known here: calibrate so")
+    if len(bend) > 8 and np.abs(bend[8:]).max() > 0:
+        raise UserError(
+            f"{path}: distortions beyond k6 (thin prism, tilt) are not known here: calibrate without"
+        )
+    check_rotation(turn, str(path))
     # OpenCV counts from the centre of the first pixel.
-    lens = _lens(size, [matrix[0, 0], matrix[1, 1]], [matrix[0, 2] + 0.5, matrix[1, 2] + 0.5], list(bend[:4]))
-    return _standing(path, "Pose2Sim", lens, cv2.Rodrigues(turn)[0], translation)
+    lens = _lens(size, [matrix[0, 0], matrix[1, 1]], [matrix[0, 2] + 0.5, matrix[1, 2] + 0.5], list(bend[:8]))
+    return _standing(path, "Pose2Sim", lens, turn, translation)
 
 
 def _standing(
@@ -112,8 +127,11 @@ def _standing(
 
 
 def _lens(size: list[int], focal: list[float], middle: list[float], bend: list[float]) -> pycolmap.Camera:
-    bend = [*bend, 0.0, 0.0, 0.0, 0.0][:4]
-    return pycolmap.Camera(model="OPENCV", width=size[0], height=size[1], params=[*focal, *middle, *bend])
+    """A lens with OpenCV's distortions k1, k2, p1, p2 and, where there are more, k3 to k6."""
+    bend = [*bend, *[0.0] * 8][:8]
+    model = "FULL_OPENCV" if any(bend[4:]) else "OPENCV"
+    bend = bend if any(bend[4:]) else bend[:4]
+    return pycolmap.Camera(model=model, width=size[0], height=size[1], params=[*focal, *middle, *bend])
 
 
 def _choose(path: Path, name: str, names: list[str]) -> str:

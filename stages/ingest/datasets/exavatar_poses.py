@@ -23,6 +23,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from pipeline.clip.frame_files import ClipFrames
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses, read_known_poses
 from pipeline.untrusted import parse_json
@@ -31,11 +32,12 @@ from stages.ingest.datasets.recording import entry, numbers
 _REMEDY = "prepare the folder again, or take smplx_optimized out of it"
 
 
-def read_exavatar_poses(folder: Path, smoothed: bool) -> InitialPoses | None:
+def read_exavatar_poses(folder: Path, clip: ClipFrames, smoothed: bool) -> InitialPoses | None:
     """The best poses that a prepared folder has; None where it has none.
 
     Args:
         folder: the subject's.
+        clip: all frames of its footage, which the files' names mean.
         smoothed: whether smoothed poses are preferred.
 
     Raises:
@@ -45,9 +47,9 @@ def read_exavatar_poses(folder: Path, smoothed: bool) -> InitialPoses | None:
     order = ["smplx_params_smoothed", "smplx_params"] if smoothed else ["smplx_params"]
     for name in order:
         if (fitted / name).is_dir():
-            return _with_identity(fitted, read_known_poses(fitted / name))
+            return _with_identity(fitted, read_known_poses(fitted / name, clip=clip))
     init = folder / "smplx_init"
-    return read_known_poses(init) if init.is_dir() else None
+    return read_known_poses(init, clip=clip) if init.is_dir() else None
 
 
 def _with_identity(fitted: Path, poses: InitialPoses) -> InitialPoses:

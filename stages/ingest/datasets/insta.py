@@ -30,9 +30,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.clip.frame_files import match_names, number_files
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
-from pipeline.untrusted import check_picture, inside, parse_json, read_torch
+from pipeline.untrusted import inside, parse_json, read_torch
 from stages.ingest.cameras.calibration import (
     EVERY_FRAME,
     CalibratedCamera,
@@ -44,14 +45,14 @@ from stages.ingest.datasets.recording import (
     Recording,
     Shot,
     entry,
+    files_of,
     numbers,
     pinhole_of_matrix,
     read_array,
-    select_frames,
 )
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, folder_clip, numbered_files
+from stages.ingest.video import PICTURES, Clip, clip_frames, folder_clip
 
 _REMEDY = "unpack the INSTA subject again"
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -66,31 +67,29 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read an actor's folder; UserError where a file of it is malformed."""
-    pictures = numbered_files(source / "images")
+    pictures = number_files(source / "images", PICTURES)
     clip = folder_clip(source / "images", pictures, 25.0)
-    tracked = select_frames(numbered_files(source / "checkpoint", (".frame",)), pictures) or {}
+    tracked = files_of(source / "checkpoint", clip, (".frame",)) or {}
     heads = {frame: _head(path) for frame, path in tracked.items()}
     path = source / "transforms.json"
     if path.is_file():
         views = _views(source, parse_json(path, _REMEDY), path, clip)
-        calibration = Calibration(path, "INSTA", views, metric=True, upright=False)
+        calibration = Calibration(path, "INSTA", views, metric=True, upright=False, by_frame=True)
     elif heads:
         lens = pinhole_of_matrix(next(iter(heads.values()))["K"], clip, source / "checkpoint", _REMEDY)
         still = CalibratedCamera(lens, np.eye(3), np.zeros(3))
         calibration = Calibration(path, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
     else:
         raise UserError(f"{source} has neither transforms.json nor checkpoint/*.frame: {_REMEDY}")
-    masks = select_frames(numbered_files(source / "alpha"), pictures) or (
-        pictures if _has_alpha(pictures) else None
-    )
+    masks = files_of(source / "alpha", clip)
     shot = Shot(clip, calibration, None, masks, "white", _poses(heads))
-    return Recording("insta", (shot,), _listed(source, "train"), _listed(source, "test"))
+    return Recording("insta", (shot,), _listed(source, "train", clip), _listed(source, "test", clip))
 
 
 def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, CalibratedCamera]:
     """Frame number -> camera."""
     views = {}
-    for number, frame in _entries(source, table, path).items():
+    for number, frame in _entries(source, table, path, clip).items():
         where = f"{path}, frame {number}"
         matrix = read_array(frame, "transform_matrix", (4, 4), where, _REMEDY)
         rotation = (matrix[:3, :3] @ _FLIP).T
@@ -112,34 +111,24 @@ def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, Calibr
     return views
 
 
-def _entries(source: Path, table: Any, path: Path) -> dict[int, dict[str, Any]]:
+def _entries(source: Path, table: Any, path: Path, clip: Clip) -> dict[int, dict[str, Any]]:
     """Frame number -> its entry; each picture must lie inside the folder."""
     frames = entry(table, "frames", path, _REMEDY)
     if not isinstance(frames, list):
         raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
-    found = {}
-    for frame in frames:
-        name = entry(frame, "file_path", path, _REMEDY)
-        picture = inside(source, str(name), path)
-        digits = "".join(c if c.isdigit() else " " for c in picture.stem).split()
-        if not digits:
-            raise UserError(f"{path} names '{str(name)[:60]}', which has no frame number: {_REMEDY}")
-        found[int(digits[-1])] = frame
-    return found
+    named = {str(entry(frame, "file_path", path, _REMEDY)): frame for frame in frames}
+    for name in named:
+        inside(source, name, path)
+    match = match_names(named, clip_frames(clip), path)
+    for name in named:
+        if name not in match.frames:
+            raise UserError(f"{path} names '{name[:60]}', which is no picture of {clip.path}: {_REMEDY}")
+    return {frame: named[name] for name, frame in match.frames.items()}
 
 
-def _listed(source: Path, part: str) -> frozenset[int] | None:
+def _listed(source: Path, part: str, clip: Clip) -> frozenset[int] | None:
     path = source / f"transforms_{part}.json"
-    return frozenset(_entries(source, parse_json(path, _REMEDY), path)) if path.is_file() else None
-
-
-def _has_alpha(pictures: dict[int, Path]) -> bool:
-    from PIL import Image
-
-    first = next(iter(pictures.values()))
-    check_picture(first, _REMEDY)
-    with Image.open(first) as picture:
-        return picture.mode in ("RGBA", "LA")
+    return frozenset(_entries(source, parse_json(path, _REMEDY), path, clip)) if path.is_file() else None
 
 
 def _head(path: Path) -> dict[str, np.ndarray]:

@@ -23,12 +23,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.clip.frame_files import number_files
 from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration_files import find_model, read_model
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import Recording, Shot, select_frames
+from stages.ingest.datasets.recording import Recording, Shot, files_of
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import folder_clip, numbered_files
+from stages.ingest.video import PICTURES, clip_frames, folder_clip
 
 _REMEDY = "unpack the NeuMan dataset again"
 _LISTS = ("train_split.txt", "test_split.txt")
@@ -42,18 +43,18 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a sequence's folder; UserError where a file of it is malformed."""
-    clip = folder_clip(source / "images", numbered_files(source / "images"))
-    masks, kind = select_frames(numbered_files(source / "masks"), clip.pictures), "white"
+    clip = folder_clip(source / "images", number_files(source / "images", PICTURES))
+    masks, kind = files_of(source / "masks", clip), "white"
     if masks is None:
-        masks, kind = select_frames(numbered_files(source / "segmentations"), clip.pictures), "inverted"
+        masks, kind = files_of(source / "segmentations", clip), "inverted"
     model = find_model(source)
     shot = Shot(
         clip=clip,
         calibration=None if model is None else read_model(model),
-        keypoints=select_frames(numbered_files(source / "keypoints_whole_body", (".json",)), clip.pictures),
+        keypoints=files_of(source / "keypoints_whole_body", clip, (".json",)),
         masks=masks,
         mask_kind=kind,
-        poses=read_exavatar_poses(source, smoothed=False),
+        poses=read_exavatar_poses(source, clip_frames(clip), smoothed=False),
     )
     train, test = _split(source, list(clip.pictures))
     return Recording("neuman", (shot,), train, test)

@@ -14,16 +14,18 @@ views. Names and conventions are those of ``prepared``.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+from pipeline.clip.frame_files import match_names, number_files
 from pipeline.errors import UserError
 from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, renumbered
+from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, files_of, renumbered
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import folder_clip, numbered_files
+from stages.ingest.video import PICTURES, clip_frames, folder_clip
 
 _REMEDY = "prepare the PERSONA subject again"
 
@@ -49,7 +51,8 @@ def read(source: Path, settings: IngestSettings) -> Recording:
 
 def _shot(folder: Path, first: int) -> Shot:
     """One clip, numbered from ``first``."""
-    pictures = numbered_files(folder / "images")
+    pictures = number_files(folder / "images", PICTURES)
+    whole = folder_clip(folder / "images", pictures)
     listed = folder / "frame_idx_list.txt"
     if listed.is_file():
         wanted = frozenset(read_numbers(listed, _REMEDY))
@@ -57,20 +60,22 @@ def _shot(folder: Path, first: int) -> Shot:
     new = {frame: first + frame for frame in pictures}
     clip = folder_clip(folder / "images", {new[frame]: file for frame, file in pictures.items()}, 30.0)
 
-    def of(files: dict[int, Path]) -> dict[int, Path] | None:
+    def of(name: str, suffixes: tuple[str, ...] = PICTURES) -> dict[int, Path] | None:
+        files = files_of(folder / name, whole, suffixes) or {}
         return {new[frame]: file for frame, file in files.items() if frame in new} or None
 
     calibration: Calibration | None = None
     if (folder / "cam_params").is_dir():
         given = open_calibration(str(folder / "cam_params"), "", clip)
         assert given is not None  # a path gives one
-        views = {str(new[int(n)]): v for n, v in given.views.items() if n.isdigit() and int(n) in new}
-        calibration = Calibration(given.path, given.kind, views, given.metric, given.upright)
-    poses = renumbered(read_exavatar_poses(folder, smoothed=False), new)
+        frames = match_names(given.views, clip_frames(whole), given.path).frames
+        views = {str(new[frame]): given.views[n] for n, frame in frames.items() if frame in new}
+        calibration = dataclasses.replace(given, views=views, by_frame=True)
+    poses = renumbered(read_exavatar_poses(folder, clip_frames(whole), smoothed=False), new)
     return Shot(
         clip,
         calibration,
-        of(numbered_files(folder / "keypoints_whole_body", (".json",))),
-        of(numbered_files(folder / "masks")),
+        of("keypoints_whole_body", (".json",)),
+        of("masks"),
         poses=poses,
     )

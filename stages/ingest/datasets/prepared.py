@@ -19,17 +19,16 @@ training list only; its frames are all learnt from. No conversion is needed but 
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Mapping
 from pathlib import Path
 
+from pipeline.clip.frame_files import match_names, number_files
 from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.calibration_files import find_model, open_calibration, read_model
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import Recording, Shot, select_frames
+from stages.ingest.datasets.recording import Recording, Shot, files_of
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, folder_clip, numbered_files, open_clip
+from stages.ingest.video import PICTURES, Clip, clip_frames, folder_clip, open_clip
 
 _REMEDY = "prepare the folder again"
 _SIGNS = ("masks", "cam_params", "keypoints_whole_body", "smplx_init", "smplx_optimized", "sparse")
@@ -44,14 +43,17 @@ def recognises(folder: Path) -> bool:
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a subject's folder; UserError where a file of it is malformed."""
     lists = _lists(source)
-    clip = _clip(source, lists.get("all"))
-    pictures = clip.pictures or None
+    whole = _clip(source)
+    clip = whole
+    if "all" in lists and whole.pictures:
+        listed = {frame: file for frame, file in whole.pictures.items() if frame in lists["all"]}
+        clip = folder_clip(whole.path, listed, whole.fps)
     shot = Shot(
         clip=clip,
-        calibration=_listed(_cameras(source, clip), clip if "all" in lists else None),
-        keypoints=_of(numbered_files(source / "keypoints_whole_body", (".json",)), pictures),
-        masks=_of(numbered_files(source / "masks"), pictures),
-        poses=read_exavatar_poses(source, smoothed=True),
+        calibration=_listed(_cameras(source, clip), whole, clip),
+        keypoints=_files_of(source / "keypoints_whole_body", whole, clip, (".json",)),
+        masks=_files_of(source / "masks", whole, clip),
+        poses=read_exavatar_poses(source, clip_frames(whole), smoothed=True),
     )
     train, test = lists.get("train"), lists.get("test")
     if train is not None and test is None and source.name.endswith("_gen"):
@@ -67,12 +69,11 @@ def _lists(source: Path) -> dict[str, frozenset[int]]:
     return {name: frozenset(read_numbers(path, _REMEDY)) for name, path in paths.items() if path.is_file()}
 
 
-def _clip(source: Path, wanted: frozenset[int] | None) -> Clip:
-    frames = numbered_files(source / "frames")
+def _clip(source: Path) -> Clip:
+    frames = number_files(source / "frames", PICTURES)
     if not frames:
         return open_clip(source / "video.mp4" if (source / "video.mp4").is_file() else source / "frames")
-    listed = {frame: file for frame, file in frames.items() if wanted is None or frame in wanted}
-    return folder_clip(source / "frames", listed, _rate(source / "video.mp4"))
+    return folder_clip(source / "frames", frames, _rate(source / "video.mp4"))
 
 
 def _rate(video: Path) -> float:
@@ -87,18 +88,20 @@ def _cameras(source: Path, clip: Clip) -> Calibration | None:
     return None
 
 
-def _listed(calibration: Calibration | None, clip: Clip | None) -> Calibration | None:
+def _listed(calibration: Calibration | None, whole: Clip, clip: Clip) -> Calibration | None:
     """The cameras of the listed frames; without a list all of them."""
-    if calibration is None or clip is None or not clip.pictures:
+    if calibration is None or clip is whole:
         return calibration
-    views = {
-        name: view
-        for name, view in calibration.views.items()
-        if int((re.findall(r"\d+", name) or ["-1"])[-1]) in clip.pictures
-    }
+    frames = match_names(calibration.views, clip_frames(whole), calibration.path).frames
+    views = {name: calibration.views[name] for name, frame in frames.items() if frame in clip.pictures}
     return dataclasses.replace(calibration, views=views or calibration.views)
 
 
-def _of(files: dict[int, Path], pictures: Mapping[int, Path] | None) -> dict[int, Path] | None:
-    """The files of the clip's frames; all of them where a video does not say which it has."""
-    return (files or None) if pictures is None else select_frames(files, pictures)
+def _files_of(
+    folder: Path, whole: Clip, clip: Clip, suffixes: tuple[str, ...] = PICTURES
+) -> dict[int, Path] | None:
+    """The files of the listed frames; all of them where a video does not say which it has."""
+    files = files_of(folder, whole, suffixes) or {}
+    return {
+        frame: file for frame, file in files.items() if not clip.pictures or frame in clip.pictures
+    } or None

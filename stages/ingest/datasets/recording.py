@@ -11,10 +11,11 @@ import numpy as np
 import pycolmap
 import torch
 
+from pipeline.clip.frame_files import match_files
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.calibration import Calibration, pinhole_lens
-from stages.ingest.video import Clip
+from stages.ingest.video import PICTURES, Clip, clip_frames
 
 SHOT_STEP = 100_000
 """Frame numbers of the n-th further shot begin at n times this."""
@@ -59,11 +60,9 @@ class Recording:
     notes: tuple[str, ...] = ()
 
 
-def select_frames(
-    files: Mapping[int, Path], frames: Sequence[int] | Mapping[int, Any]
-) -> dict[int, Path] | None:
-    """The files of some frames; None where there are none."""
-    return {frame: file for frame, file in files.items() if frame in frames} or None
+def files_of(folder: Path, clip: Clip, suffixes: Sequence[str] = PICTURES) -> dict[int, Path] | None:
+    """The files of a folder that belong to frames of a clip, by frame number; None where there are none."""
+    return match_files(folder, suffixes, clip_frames(clip))[0] or None
 
 
 _PER_FRAME = ("rotation", "expression", "transl", "valid", "hand_pca")

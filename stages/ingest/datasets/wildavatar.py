@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.clip.frame_files import number_files
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import parse_json
@@ -27,13 +28,13 @@ from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, che
 from stages.ingest.datasets.recording import (
     Recording,
     Shot,
+    files_of,
     pinhole_of_matrix,
     read_array,
-    select_frames,
 )
 from stages.ingest.datasets.smplx_poses import SMPL_ROOT, smpl_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import Clip, folder_clip, numbered_files
+from stages.ingest.video import PICTURES, Clip, folder_clip
 
 _REMEDY = "unpack the WildAvatar subject again"
 _SHAPES = (("cam_intrinsics", (3, 3)), ("cam_extrinsics", (4, 4)), ("poses", (72,)), ("betas", (-1,)))
@@ -46,15 +47,15 @@ def recognises(folder: Path) -> bool:
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a subject's folder; UserError where a file of it is malformed."""
-    clip = folder_clip(source / "images", numbered_files(source / "images"))
+    clip = folder_clip(source / "images", number_files(source / "images", PICTURES))
     path = source / "metadata.json"
     frames = _frames(parse_json(path, _REMEDY), path)
     frames = {frame: one for frame, one in frames.items() if frame in clip.pictures}
     if not frames:
         raise UserError(f"{path} describes none of the pictures in {clip.path}: {_REMEDY}")
     views = {str(frame): _view(one, clip, f"{path}, frame {frame}") for frame, one in frames.items()}
-    calibration = Calibration(path, "WildAvatar", views, metric=True, upright=False)
-    masks = select_frames(numbered_files(source / "masks"), clip.pictures)
+    calibration = Calibration(path, "WildAvatar", views, metric=True, upright=False, by_frame=True)
+    masks = files_of(source / "masks", clip)
     return Recording("wildavatar", (Shot(clip, calibration, None, masks, "white", _poses(frames)),))
 
 

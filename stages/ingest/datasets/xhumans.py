@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeline.clip.frame_files import number_files
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_npz, read_pickle
@@ -32,14 +33,14 @@ from stages.ingest.datasets.recording import (
     Recording,
     Shot,
     entry,
+    files_of,
     numbers,
     pinhole_of_matrix,
     read_array,
-    select_frames,
 )
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import folder_clip, numbered_files
+from stages.ingest.video import PICTURES, folder_clip
 
 _REMEDY = "unpack the X-Humans take again"
 _BODY = (("global_orient", 3, 0), ("body_pose", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
@@ -54,7 +55,7 @@ def recognises(folder: Path) -> bool:
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read a take's folder; UserError where a file of it is malformed."""
     render = source / "render"
-    clip = folder_clip(render / "image", numbered_files(render / "image"), 30.0)
+    clip = folder_clip(render / "image", number_files(render / "image", PICTURES), 30.0)
     path = render / "cameras.npz"
     table = read_npz(path, _REMEDY)
     cameras = _cameras(table, path, list(clip.pictures))
@@ -62,10 +63,10 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     views = {str(frame): CalibratedCamera(lens, *pose) for frame, pose in cameras.items()}
     shot = Shot(
         clip=clip,
-        calibration=Calibration(path, "X-Humans", views, metric=True, upright=False),
-        keypoints=select_frames(numbered_files(render / "keypoints_whole_body", (".json",)), clip.pictures),
-        masks=select_frames(numbered_files(render / "mask"), clip.pictures),
-        poses=_poses(numbered_files(source / "SMPLX", (".pkl",)), cameras),
+        calibration=Calibration(path, "X-Humans", views, metric=True, upright=False, by_frame=True),
+        keypoints=files_of(render / "keypoints_whole_body", clip, (".json",)),
+        masks=files_of(render / "mask", clip),
+        poses=_poses(files_of(source / "SMPLX", clip, (".pkl",)) or {}, cameras),
     )
     return Recording("xhumans", (shot,))
 

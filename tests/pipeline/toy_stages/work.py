@@ -70,3 +70,19 @@ def sing(context):
     elif Path(tune).is_file():
         tune = Path(tune).read_text()
     (context.output / "song.txt").write_text((context.inputs["bend"] / "bent.txt").read_text() + tune)
+
+
+def compile_slowly():
+    """Stands for kernels that take a minute; says who compiles, at which priority."""
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])
+    (folder / f"compiles-{os.getpid()}").write_text(str(os.nice(0)))
+    time.sleep(60)
+
+
+def compile_badly():
+    raise ZeroDivisionError("ours")
+
+
+def compile_quickly():
+    with (Path(os.environ["NUMBA_CACHE_DIR"]) / "compiled").open("a") as file:
+        file.write("once\n")

@@ -8,6 +8,7 @@ from pipeline.run.stage import Stage
 class PaintSettings:
     iterations: Iterations = 3
     rate: Fraction | None = None
+    kernels: bool = False  # there are some to compile
 
 
 STAGE = Stage(
@@ -16,4 +17,7 @@ STAGE = Stage(
     PaintSettings,
     "tests.pipeline.toy_stages.work:paint",
     needs={"gather": ("text.txt",), "bend": ("*",)},
+    compile_ahead=lambda settings: (
+        "tests.pipeline.toy_stages.work:compile_slowly" if settings.kernels else ""
+    ),
 )
