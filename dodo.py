@@ -108,7 +108,8 @@ def kept_subjects(request: Request) -> set[str]:
 REQUEST, CHOSEN = read_command_line()
 WORKSPACE = REQUEST.workspace
 STAGES = load_stages(WORKSPACE.stages)
-SUBJECTS = tuple(sorted({*known_subjects(WORKSPACE), *CHOSEN, *stored_subjects(REQUEST)}))
+MADE = {*known_subjects(WORKSPACE), *CHOSEN}  # what others are lent of these is made first
+SUBJECTS = tuple(sorted({*MADE, *stored_subjects(REQUEST)}))
 ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
 # "doit clean" deletes what the default tasks made: all of it, also what is only made when asked for.
 DEFAULT = [usual(STAGES)[-1], *(ON_REQUEST if "clean" in sys.argv[1:2] else ())]
@@ -172,7 +173,7 @@ def needed_of_others(stage: str, subject: str) -> list[str]:
         loans = STAGES[stage].demands(job_of(subject).settings[stage]).loans
     except UserError:
         return []  # the stage itself reports it
-    return [f"{loan.stage}:{loan.subject}" for loan in loans if loan.subject in SUBJECTS]
+    return [f"{loan.stage}:{loan.subject}" for loan in loans if loan.subject in MADE]
 
 
 def remove_versions(stage: str, subject: str) -> None:
