@@ -254,6 +254,12 @@ def filmed(scene: Scene, number: int, camera: Camera) -> FilmedFrame:
     return film(scene, number, camera, make_background(camera, scene.seed))
 
 
+def on_black(scene: Scene, number: int, camera: Camera) -> tuple[Tensor, np.ndarray]:
+    """The person alone as it was before the camera, on black: [H, W, 3], and its mask [H, W] uint8."""
+    picture = film(scene, number, camera, np.zeros((camera.height, camera.width, 3), np.float32))
+    return torch.from_numpy(picture.image * (picture.mask > 0)[..., None]).float() / 255, picture.mask
+
+
 def shown_by(stage: Stage, avatar: Avatar) -> Shown:
     """What an avatar shows."""
 
@@ -280,10 +286,9 @@ def compared(stage: Stage, name: str, shown: Shown, network: Lpips) -> tuple[lis
     for degrees in ANGLES:
         scores, camera = [], around(stage.scene, degrees)
         for number in stage.clip.split.test:
-            picture = filmed(stage.scene, number, camera)
-            truth, (image, alpha) = composite_frame(picture.image, picture.mask), shown(number, camera)
-            part = box_of(picture.mask).slices
-            moved = shifted(image, alpha, picture.mask)
+            truth, mask = on_black(stage.scene, number, camera)
+            image, alpha = shown(number, camera)
+            part, moved = box_of(mask).slices, shifted(image, alpha, mask)
             scores.append(
                 (
                     psnr(image[part], truth[part]),
