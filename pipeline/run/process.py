@@ -80,16 +80,17 @@ def leave_reason(message: str) -> None:
 def process_environment() -> dict[str, str]:
     """The environment of a stage's process, which finds the packages from wherever the user stands.
 
-    The malloc thresholds keep large activations on the heap instead of asking the kernel for fresh
-    zeroed pages at every step; they must be set before Python starts.
+    A process that has it is given the same again. The malloc thresholds keep large activations on the heap
+    instead of asking the kernel for fresh zeroed pages at every step; they must be set before Python starts.
     """
     defaults = {
         "MALLOC_MMAP_THRESHOLD_": "4294967296",
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
     }
-    places = (str(REPOSITORY), os.environ.get("PYTHONPATH", ""))
-    return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(place for place in places if place)}
+    given = [place for place in os.environ.get("PYTHONPATH", "").split(os.pathsep) if place]
+    places = [str(REPOSITORY), *(place for place in given if place != str(REPOSITORY))]
+    return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(places)}
 
 
 def killed_by(number: int) -> str:
