@@ -88,8 +88,9 @@ def process_environment() -> dict[str, str]:
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
     }
-    given = [place for place in os.environ.get("PYTHONPATH", "").split(os.pathsep) if place]
-    places = [str(REPOSITORY), *(place for place in given if place != str(REPOSITORY))]
+    # Once only: a process that starts itself again until its environment is this one must come to an end.
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    places = [str(REPOSITORY), *(place for place in given if place and place != str(REPOSITORY))]
     return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(places)}
 
 

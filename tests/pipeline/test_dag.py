@@ -5,9 +5,6 @@ import os
 import signal
 import time
 
-from pipeline.run.process import process_environment
-from tests.conftest import REPOSITORY
-
 
 def test_a_run_makes_every_stage_and_a_second_run_makes_none(toy):
     first = toy.doit("subject=ann")
@@ -226,11 +223,3 @@ def test_a_subject_that_is_made_up_needs_no_footage(toy):
     toy.subject("nothing", 'title = "no footage named"\n')
     run = toy.doit("subject=nothing")
     assert run.returncode != 0 and "source=CLIP.mp4" in run.stderr and "Traceback" not in run.stderr
-
-
-def test_a_stages_environment_is_the_same_for_a_process_that_has_it(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(("/somewhere", str(REPOSITORY))))
-    once = process_environment()
-    assert once["PYTHONPATH"].split(os.pathsep) == [str(REPOSITORY), "/somewhere"]
-    monkeypatch.setenv("PYTHONPATH", once["PYTHONPATH"])
-    assert process_environment()["PYTHONPATH"] == once["PYTHONPATH"]  # a benchmark starts itself with it
