@@ -39,7 +39,7 @@ class BasesRepresentation(Representation):
         signal_mean, signal_components, signal_limits: of the driving signal; zero before ``set_clip``.
     """
 
-    half_stored = frozenset({"offset", "log_scale", "color", "bases"})
+    half_stored = frozenset({"offset", "log_scale", "color", "bases", "base_color", "trust"})
     signal_mean: Tensor
     signal_components: Tensor
     signal_limits: Tensor

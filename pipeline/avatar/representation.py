@@ -129,7 +129,7 @@ class Representation(nn.Module, abc.ABC):
     """What of an avatar is learnt.
 
     Attributes:
-        half_stored: names of the parameters that a file holds as float16.
+        half_stored: names of parameters, and of the avatar's buffers, that a file holds as float16.
     """
 
     half_stored: frozenset[str] = frozenset()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.avatar import Avatar
+from pipeline.avatar.skinning_tables import OWN
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError
 
@@ -35,6 +36,8 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
         stored: tensor.half() if stored.removeprefix("network.") in half else tensor
         for stored, tensor in ((_stored_name(name), tensor) for name, tensor in avatar.state_dict().items())
     }
+    if bool((avatar.skin_rows == OWN).all()):
+        del tensors[_stored_name("skin_rows")]  # each has its own vertex's weights
     for field in IDENTITY_FIELDS:
         tensors[f"identity.{field}"] = torch.as_tensor(getattr(avatar.identity, field))
     for name, tensor in tensors.items():
@@ -115,6 +118,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
         for stored, tensor in tensors.items()
         if stored.startswith("network.")
     }
+    weights.setdefault("skin_rows", avatar.skin_rows)
     try:
         avatar.load_state_dict(weights)
     except RuntimeError as error:

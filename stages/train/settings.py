@@ -80,8 +80,9 @@ class TrainSettings:
     held_out_every: Count = setting(100, "iterations between points of the held-out curve")
     held_out_frames: CountOrNone = setting(3, "frames of each such point")
     checkpoint_every: Count = setting(250, "iterations between checkpoints")
-    # One: bytes do not depend on the number of cores. Two are 1.5 times as fast (docs/log/2026-11.md).
-    threads: Threads = setting(1, "of the CPU, 0 for all")
+    # Two are 1.7 times as fast as one. Their bytes are equal wherever there are two cores or more of a kind;
+    # sums of a single core are others (docs/stability.md).
+    threads: Threads = setting(2, "of the CPU, 0 for all")
     # Equal runs give equal bytes on a CPU only, and the key of an artifact holds this word, not what it came
     # to mean (pipeline/device.py); run.json does.
     device: Device = setting("auto", "where it computes; auto: cuda where there is a GPU and gsplat")

@@ -48,6 +48,7 @@ TINY = TrainSettings(
     face=0.8,
     lpips=0.0,
     lpips_from=0.0,
+    threads=1,
     visits=0.0,
 )
 
