@@ -38,8 +38,8 @@ from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
 from pipeline.run.effect import check_effect, named_tasks, running
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
-from pipeline.run.process import run_stage_process
 from pipeline.run.stage import load_stages, usual
+from pipeline.run.stage_runner import StageRunner
 from pipeline.store.artifact import Store
 from pipeline.store.verify import verify
 
@@ -108,6 +108,7 @@ def kept_subjects(request: Request) -> set[str]:
 REQUEST, CHOSEN = read_command_line()
 WORKSPACE = REQUEST.workspace
 STAGES = load_stages(WORKSPACE.stages)
+RUNNER = StageRunner(REQUEST)
 MADE = {*known_subjects(WORKSPACE), *CHOSEN}  # what others are lent of these is made first
 SUBJECTS = tuple(sorted({*MADE, *stored_subjects(REQUEST)}))
 ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
@@ -150,12 +151,16 @@ def compile_once(functions: tuple[str, ...]) -> None:
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself.
 
-    Beside it, the kernels of the stages after it are compiled where they never were.
+    Beside it, the kernels of the stages after it are compiled where they never were, and the next stage loads
+    its code.
     """
+    following = None
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it
         asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
         compile_once(kernels_ahead(job_of(subject), asked, stage))
-    reason = run_stage_process(stage, subject, REQUEST)
+        if len(CHOSEN) == 1 and stage in asked[:-1]:
+            following = asked[asked.index(stage) + 1]
+    reason = RUNNER.run(stage, subject, following)
     return TaskFailed(reason) if reason else None
 
 

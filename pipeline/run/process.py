@@ -23,6 +23,7 @@ from pipeline.store.artifact import Artifact
 REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
 
+GO = b"go\n"
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
@@ -35,39 +36,73 @@ def stage_command(stage: str, subject: str, request: Request) -> list[str]:
     return [sys.executable, "-P", "-m", "pipeline", stage, "--subject", subject, *pairs]
 
 
-def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
-    """Runs a stage in a process that writes to this terminal and ends with this one.
+class StageProcess:
+    """A stage in a process that writes to this terminal and ends with this one."""
 
-    Args:
-        stage: its name.
-        subject: whose.
-        request: the command line's.
-        log: a file that gets the stage's lines in place of this terminal.
+    def __init__(
+        self, stage: str, subject: str, request: Request, log: Path | None = None, waits: bool = False
+    ):
+        """Starts it.
 
-    Returns:
-        Why it failed, in a line; None where it did not.
-    """
-    with tempfile.TemporaryDirectory(prefix="flexiavatar-") as folder:
-        reason = Path(folder) / "reason"
-        environment = {**process_environment(), REASON: str(reason)}
-        command = stage_command(stage, subject, request)
+        Args:
+            stage: its name.
+            subject: whose.
+            request: the command line's.
+            log: a file that gets the stage's lines in place of this terminal.
+            waits: it loads the stage's code, and waits for ``finish``.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="flexiavatar-")
+        self._log, self._waits = log, waits
+        self._reason = Path(self._folder.name) / "reason"
+        command = [*stage_command(stage, subject, request), *(["--waits"] if waits else [])]
         with contextlib.ExitStack() as stack:
             out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
-            status = subprocess.run(
+            self._process = subprocess.Popen(
                 command,
-                env=environment,
+                env={**process_environment(), REASON: str(self._reason)},
+                stdin=subprocess.PIPE if waits else None,
                 stdout=out,
                 stderr=out,
-                check=False,
                 preexec_fn=ending_with_this_process(),
-            ).returncode
-        said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
-    if status < 0:
-        return killed_by(-status)
-    if status:
-        where = "its own lines above say why" if log is None else f"{log} says why"
-        return said or f"stopped with status {status}; {where}"
-    return None
+            )
+
+    def finish(self) -> str | None:
+        """Lets it go on if it waits; returns why it failed, in a line, and None where it did not."""
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it has ended; its status says how
+                self._process.communicate(GO if self._waits else None)
+        except BaseException:
+            self._process.kill()
+            self._process.wait()
+            raise
+        said = self._reason.read_text(encoding="utf-8") if self._reason.is_file() else ""
+        self._folder.cleanup()
+        status = self._process.wait()
+        if status < 0:
+            return killed_by(-status)
+        if status:
+            where = "its own lines above say why" if self._log is None else f"{self._log} says why"
+            return said or f"stopped with status {status}; {where}"
+        return None
+
+    def close(self) -> None:
+        """Ends one that waits and is not needed."""
+        with contextlib.suppress(BrokenPipeError):
+            self._process.communicate(b"")
+        self._folder.cleanup()
+
+
+def told_to_go_on() -> bool:
+    """Waits for the word that ``StageProcess.finish`` sends; False where none will come."""
+    try:
+        return sys.stdin.buffer.readline() == GO
+    except (KeyboardInterrupt, ValueError):
+        return False
+
+
+def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
+    """Runs a stage as ``StageProcess``; returns why it failed, in a line, and None where it did not."""
+    return StageProcess(stage, subject, request, log).finish()
 
 
 def leave_reason(message: str) -> None:
