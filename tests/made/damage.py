@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors
+from safetensors.numpy import save_file
 
 from pipeline.errors import UserError
 
@@ -75,7 +77,7 @@ def odd_array(array, rng):
             return array[..., : rng.randrange(4)] if array.ndim else array.reshape(1)
         case 2:
             return array[None] if rng.random() < 0.5 else array.reshape(-1)
-        case 3:
+        case 3 if array.dtype.kind in "fiub":
             return np.where(np.random.default_rng(rng.randrange(99)).random(array.shape) < 0.1, rng.choice(
                 [np.nan, np.inf, 1e30, -1e-300]), array)  # fmt: skip
         case 4:
@@ -125,12 +127,33 @@ def odd_value(value: Any, rng: random.Random) -> Any:
     return rng.choice(ODD_VALUES)
 
 
+def odd_safetensors(path: Path, rng: random.Random) -> None:
+    """A file of tensors of which one is odd or missing, or whose metadata say something else."""
+    with safetensors.safe_open(path, "np") as file:
+        words, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    name = rng.choice(sorted(words) * 3 + sorted(arrays))
+    if name in words:
+        try:
+            words[name] = json.dumps(odd_value(json.loads(words[name]), rng))
+        except ValueError:
+            words[name] = rng.choice(["", "x", "{}", "[]"])
+    elif rng.random() < 0.3:
+        del arrays[name]
+    else:
+        odd = odd_array(arrays[name], rng)
+        known = odd.dtype.str in ("<f4", "<f8", "|i1", "|b1")
+        arrays[name] = np.ascontiguousarray(odd) if known else np.zeros((rng.randrange(3), 2), np.float32)
+    save_file(arrays, path, words)
+
+
 def damage(path: Path, rng: random.Random) -> None:
     """Change a file: its values where its kind is known, or its bytes."""
     kind = path.suffix
-    if rng.random() < 0.5 and kind in (".json", ".pkl", ".npy", ".npz"):
+    if rng.random() < 0.5 and kind in (".json", ".pkl", ".npy", ".npz", ".safetensors"):
         if kind == ".json":
             path.write_text(json.dumps(odd_value(json.loads(path.read_text()), rng)))
+        elif kind == ".safetensors":
+            odd_safetensors(path, rng)
         elif kind == ".npz":
             odd_archive(path, rng)
         elif kind == ".npy":
