@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import safetensors
 import torch
@@ -15,7 +16,7 @@ from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.skinning_tables import OWN
 from pipeline.body import BodyModel, Identity
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 
 FORMAT = "flexiavatar-avatar-4"
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
@@ -97,6 +98,21 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     True
     """
     header, tensors = _read(path)
+    try:
+        return _avatar_of(path, body, header, tensors)
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+        IndexError,
+        AttributeError,
+        OverflowError,
+    ) as error:
+        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+
+
+def _avatar_of(path: Path, body: BodyModel, header: dict[str, Any], tensors: dict[str, Tensor]) -> Avatar:
     if header.get("format") != FORMAT:
         raise UserError(f"{path} is not an avatar of this version; run the train stage again")
     if header["body"] != body.digest:
@@ -106,10 +122,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
     architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
     splits = [tensors[name].long() for name in sorted(tensors) if name.startswith("splits.")]
     half = header["half_precision"]
-    try:
-        avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
-    except ValueError as error:
-        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
     if header["completed"]:
         avatar.completion = torch.zeros(len(avatar.trust), 9)
     names = {_stored_name(name): name for name in avatar.state_dict()}
@@ -119,10 +132,7 @@ def load_avatar(path: Path, body: BodyModel) -> Avatar:
         if stored.startswith("network.")
     }
     weights.setdefault("skin_rows", avatar.skin_rows)
-    try:
-        avatar.load_state_dict(weights)
-    except RuntimeError as error:
-        raise UserError(f"{path} does not fit its own description; run the train stage again") from error
+    avatar.load_state_dict(weights)
     avatar.apply_skin()
     avatar.pose_heads_active = header["pose_heads_active"]
     avatar.residuals_active = header["residuals_active"]
@@ -134,6 +144,8 @@ def _read(path: Path) -> tuple[dict, dict[str, Tensor]]:
     try:
         with safetensors.safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get("avatar", "{}"))
+            if not isinstance(header, dict):
+                raise ValueError("its description is no table")
             return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise UserError(f"{path} cannot be read ({error}); run the train stage again") from error
+    except (OSError, ValueError, RecursionError, safetensors.SafetensorError) as error:
+        raise UserError(f"{path} cannot be read ({first_line(error)}); run the train stage again") from error

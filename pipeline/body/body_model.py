@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 
 # shapedirs' last axis -> (shape columns, expression columns): releases since 2020, and before.
 _LAYOUTS = {400: (slice(0, 300), slice(300, 400)), 20: (slice(0, 10), slice(10, 20))}
@@ -106,8 +105,10 @@ def load_body(path: Path) -> BodyModel:
             return _assemble(path, _Reader(path, archive))
     except FileNotFoundError:
         raise _refuse(path, "does not exist") from None
-    except (OSError, EOFError, zipfile.BadZipFile, ValueError, AttributeError) as error:
-        raise _refuse(path, f"cannot be read as npz ({error})") from error
+    except UserError:
+        raise
+    except Exception as error:  # a damaged archive raises nearly anything
+        raise _refuse(path, f"cannot be read as npz ({first_line(error)})") from error
 
 
 class _Reader:

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pipeline.body.body_model import BodyModel
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +103,14 @@ def read_identity(path: Path, body: BodyModel) -> Identity:
             if (file.metadata() or {}).get("body") != body.digest:
                 raise UserError(f"{path} was fitted with another body model: run the fit stage again")
             names = [field.name for field in dataclasses.fields(Identity)]
-            return Identity(**{name: file.get_tensor(name) for name in names})
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} cannot be read ({error}): run the fit stage again") from error
+            arrays = {name: file.get_tensor(name) for name in names}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({first_line(error)}): run the fit stage again") from error
+    mean = mean_identity(body)
+    for name, array in arrays.items():
+        same = name == "betas" and array.ndim == 1 and len(array) <= body.shape_directions.shape[2]
+        if not (same or array.shape == getattr(mean, name).shape) or not bool(torch.isfinite(array).all()):
+            raise UserError(
+                f"{path}: {name} does not fit the body, or is not finite: run the fit stage again"
+            )
+    return Identity(**arrays)

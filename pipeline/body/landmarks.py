@@ -14,7 +14,6 @@ Four sets, each in its estimator's order:
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body.body_model import BodyModel
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 
 SIZES = {"whole_body": 133, "pose": 33, "hands": 42, "face_mesh": 478}
 """The sets and how many points each has."""
@@ -120,8 +119,8 @@ def load_landmarks(body: BodyModel, folder: Path) -> Landmarks:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return Landmarks(**{name: _point_set(archive, name, body) for name in SIZES})
-    except (OSError, EOFError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} cannot be read as landmarks ({error}): {remedy}") from error
+    except Exception as error:  # a damaged archive raises nearly anything
+        raise UserError(f"{path} cannot be read as landmarks ({first_line(error)}): {remedy}") from error
 
 
 def _point_set(archive: np.lib.npyio.NpzFile, name: str, body: BodyModel) -> PointSet:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body.joints import JOINT_NAMES
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 from pipeline.files.tables import open_table
 from pipeline.finite import NotFiniteError, rows_not_finite
 
@@ -157,7 +157,9 @@ def read_poses(path: Path) -> Poses:
         valid = {"valid": _truths(table, "valid")} if "valid" in table.column_names else {}
         return Poses(frames, rotation.unflatten(1, (_JOINTS, 3)), expression, transl, **valid)
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, pa.ArrowInvalid) as error:
-        raise UserError(f"{path} cannot be read as poses ({error}): run the fit stage again") from error
+        raise UserError(
+            f"{path} cannot be read as poses ({first_line(error)}): run the fit stage again"
+        ) from error
 
 
 def _column(values: Tensor) -> pa.FixedSizeListArray:

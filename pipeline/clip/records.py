@@ -10,6 +10,7 @@ world-to-camera with OpenCV axes as in :mod:`pipeline.clip.camera`.
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
+from pydantic import TypeAdapter, ValidationError
 
 from pipeline.clip.camera import Camera
 from pipeline.clip.frame_files import ClipFrames
@@ -168,4 +170,13 @@ def read_footage(path: Path) -> Footage:
     names = {field.name for field in dataclasses.fields(Footage)}
     if not isinstance(value, dict) or set(value) != names:
         raise UserError(f"{path}: its fields are not {', '.join(sorted(names))}: {_REMEDY}")
-    return Footage(**{**value, "seconds": tuple(value["seconds"])})
+    try:
+        footage = TypeAdapter(Footage).validate_json(json.dumps(value), strict=True)
+    except ValidationError as error:
+        place = ".".join(map(str, error.errors()[0]["loc"]))
+        raise UserError(f"{path}: {place} is no such value as ingest writes: {_REMEDY}") from None
+    counts = (footage.width, footage.height, footage.read, footage.kept, footage.total)
+    numbered = all(name.isascii() and name.isdigit() and len(name) < 10 for name in footage.names)
+    if not all(0 <= count < 2**31 for count in counts) or not numbered:
+        raise UserError(f"{path}: a count or a frame's number is out of range: {_REMEDY}")
+    return footage

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.datasets import load_dataset
+from pipeline.config.datasets import known_datasets, load_dataset
 from pipeline.config.settings import Layer, near, read_toml
 from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
@@ -93,6 +93,8 @@ def parse_subject(
     """The subject that a file's content describes."""
     tables = {name: value for name, value in content.items() if name not in ("title", "dataset", "source")}
     footage = content.get("source", {})
+    if not isinstance(footage, dict) or not all(isinstance(text, str) for text in footage.values()):
+        raise UserError(f"{path}: [source] is a table of texts: 'asset' and 'file', or 'path' and 'obtain'")
     unknown = set(footage) - {"asset", "file", "path", "obtain"}
     if unknown:
         raise UserError(
@@ -100,7 +102,13 @@ def parse_subject(
         )
     layers, obtain = [Layer(str(path), tables)], str(footage.get("obtain", ""))
     if "dataset" in content:
-        dataset = load_dataset(workspace, str(content["dataset"]))
+        known = known_datasets(workspace)
+        if content["dataset"] not in known:
+            named = str(content["dataset"])[:60]
+            raise UserError(
+                f"{path}: there is no dataset={named}, only {', '.join(known)}{near(named, known)}"
+            )
+        dataset = load_dataset(workspace, content["dataset"])
         layers.insert(0, dataset.layer)
         obtain = obtain or dataset.obtain
     asset = footage.get("asset") if source is None else None

@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from pipeline.body import BodyModel
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_line
 
 INITIAL_POSES = "initial_poses.safetensors"
 _WORDS = ("hands", "model", "fitted")
@@ -114,8 +114,8 @@ def read_initial_poses(path: Path) -> InitialPoses:
             frames=frames, valid=valid, hands=words["hands"], model=words["model"],
             fitted=words["fitted"] == "True", **{**absent, **arrays},
         )  # fmt: skip
-    except (SafetensorError, OSError, KeyError, TypeError, RuntimeError) as error:
-        raise UserError(f"{path} cannot be read as initial poses ({error}): {_REMEDY}") from None
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise UserError(f"{path} cannot be read as initial poses ({first_line(error)}): {_REMEDY}") from None
     if poses.rotation.shape != (len(frames), 55, 3) or valid.shape != (len(frames),):
         raise UserError(f"{path}: its arrays do not fit its {len(frames)} frames: {_REMEDY}")
     return poses

@@ -188,7 +188,7 @@ def _scored(table: dict[str, Any], path: Path) -> list[np.ndarray]:
     if scores is None:
         if points.ndim == 1 and points.size % 3 == 0:
             return [points.reshape(-1, 3)]
-        if points.shape[-1] != 3:
+        if points.ndim < 2 or points.shape[-1] != 3:
             raise _refusal(path, "a person without matching 'keypoints' and 'keypoint_scores'")
         return list(points.reshape(-1, *points.shape[-2:]))
     weights = _array(scores, path)

@@ -50,7 +50,7 @@ def open_container(path: Path) -> av.container.InputContainer:
     if not path.is_file():
         raise UserError(f"{path} is no file but a pipe or a device: {VIDEO_REMEDY}")
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")
     except (av.FFmpegError, OSError) as error:
         if _lacks_index(path):
             raise UserError(
@@ -70,7 +70,11 @@ def footage_stream(path: Path, container: av.container.InputContainer) -> VideoS
     Raises:
         UserError: the file has pictures alone, as a song with a cover has.
     """
-    moving = [one for one in container.streams.video if not one.disposition & _STILL]
+    # A damaged header may name a codec that nobody knows.
+    known = [one for one in container.streams.video if one.codec_context is not None]
+    if not known:
+        raise UserError(f"{path} has video of an unknown codec, or a damaged header: {VIDEO_REMEDY}")
+    moving = [one for one in known if not one.disposition & _STILL]
     if not moving:
         raise UserError(f"{path} has a cover picture and no video: {VIDEO_REMEDY}")
     # A cover that nobody marked is a picture's codec beside a video's, or one frame beside many.

@@ -1,13 +1,9 @@
 """Damaged motion files of every kind: a motion or one line, no traceback, no hang, nothing executed."""
 
-import io
 import json
 import random
 import time
-import warnings
-import zipfile
 
-import numpy as np
 import pytest
 import torch
 
@@ -18,89 +14,10 @@ from stages.animate.motions.read import DrivenPerson, read_motion
 from stages.animate.motions.source import MotionSource
 from tests.made.body import BODY_FILE
 from tests.made.captured_skeletons import SKELETONS, write_captured
+from tests.made.damage import MOST_SECONDS, ODD_VALUES, mutated, odd_archive
 from tests.made.motions import made_up, write_folder, write_npz
 
 FILES = 400  # of each kind
-MOST_SECONDS = 20.0  # for one file, on a busy machine
-WORDS = (
-    b"nan", b"inf", b"-1e999", b"1e308", b"99999999999999999999", b"-7", b"0", b"{", b"}", b"[", b"]",
-    b"null", b"{}",
-    b"CHANNELS 3 Zrotation Xrotation Zrotation", b"CHANNELS 99999999", b"End Site {", b"OFFSET", b"JOINT x {",
-    b"MOTION", b"Frames: 3", b"\xff\xfe", b"\xef\xbb\xbf", b"\x00", b'"root_pose"', b"\xed\xa0\x80",
-)  # fmt: skip
-
-
-class Evil:
-    def __reduce__(self):
-        return (print, ("executed",))
-
-
-def mutated(content, rng):
-    """Bytes with one to four pieces changed, put in, taken out, doubled, or all cut off behind a place."""
-    content = bytearray(content)
-    for _ in range(rng.randint(1, 4)):
-        at, size = rng.randrange(len(content) + 1), rng.choice((1, 1, 4, 30, 300))
-        match rng.randrange(6):
-            case 0:
-                content[at : at + size] = rng.randbytes(min(size, 30))
-            case 1:
-                content[at:at] = rng.choice(WORDS)
-            case 2:
-                del content[at : at + size]
-            case 3:
-                content[at:at] = content[at : at + size]
-            case 4:
-                words = bytes(content).split(b" ")
-                words[rng.randrange(len(words))] = rng.choice(WORDS)
-                content = bytearray(b" ".join(words))
-            case 5:
-                if rng.random() < 0.2:
-                    del content[at:]
-    return bytes(content)
-
-
-def odd_array(array, rng):
-    """An array of another type or shape, with other numbers, or of objects."""
-    match rng.randrange(8):
-        case 0:
-            return array.astype(
-                rng.choice([np.float16, np.int8, np.uint64, np.complex64, bool, ">f8", "S4", "U4"])
-            )
-        case 1:
-            return array[..., : rng.randrange(4)] if array.ndim else array.reshape(1)
-        case 2:
-            return array[None] if rng.random() < 0.5 else array.reshape(-1)
-        case 3:
-            return np.where(np.random.default_rng(rng.randrange(99)).random(array.shape) < 0.1, rng.choice(
-                [np.nan, np.inf, 1e30, -1e-300]), array)  # fmt: skip
-        case 4:
-            return np.array([Evil(), *array.reshape(-1)[:3]], object)
-        case 5:
-            return np.array({"poses": array}, object)
-        case 6:
-            return array.reshape(-1)[:0]
-        case _:
-            return np.zeros((rng.randrange(3), rng.randrange(4), rng.randrange(200)))
-
-
-def odd_archive(path, rng):
-    """An archive whose arrays are odd, or whose bytes are."""
-    if rng.random() < 0.5:
-        path.write_bytes(mutated(path.read_bytes(), rng))
-        return
-    arrays = dict(np.load(path))
-    for name in rng.sample(sorted(arrays), rng.randint(1, len(arrays))):
-        if rng.random() < 0.3:
-            arrays.pop(name)
-        else:
-            arrays[name] = odd_array(arrays[name], rng)
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    if rng.random() < 0.2:
-        with warnings.catch_warnings(), zipfile.ZipFile(buffer, "a") as archive:
-            warnings.simplefilter("ignore")  # a name twice
-            archive.writestr(rng.choice(["../poses.npy", "poses.npy", "betas.npy"]), rng.randbytes(90))
-    path.write_bytes(buffer.getvalue())
 
 
 def odd_frame(folder, rng):
@@ -110,21 +27,7 @@ def odd_frame(folder, rng):
         path.write_bytes(mutated(path.read_bytes(), rng))
         return
     values = json.loads(path.read_text())
-    name = rng.choice(sorted(values))
-    odd = [
-        None,
-        [],
-        [None] * 3,
-        "x",
-        {"a": 1},
-        [[1, 2], 3],
-        1e9,
-        True,
-        [float("nan")] * 3,
-        [[[1]]],
-        [10**400],
-    ]
-    values[name] = rng.choice(odd)
+    values[rng.choice(sorted(values))] = rng.choice(ODD_VALUES)
     path.write_text(json.dumps(values))
 
 

@@ -102,7 +102,7 @@ def _numbers(path: Path, values: object) -> np.ndarray:
     """A list of finite numbers, [K] float32; nested lists are flattened."""
     try:
         array = np.asarray(values, np.float32).reshape(-1)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path} holds something else than numbers: {_REMEDY}") from error
     if array.size == 0 or not np.isfinite(array).all():
         raise UserError(f"{path} holds numbers that are not finite, or none: {_REMEDY}")

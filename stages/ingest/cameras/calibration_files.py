@@ -17,6 +17,7 @@ from stages.ingest.cameras.calibration import (
     check_rotation,
     pinhole_lens,
 )
+from stages.ingest.cameras.model_bytes import check_model_bytes
 from stages.ingest.cameras.rig import read_rig
 from stages.ingest.video import Clip
 
@@ -69,12 +70,14 @@ def read_model(folder: Path) -> Calibration:
     Raises:
         UserError: damaged, or without a registered picture.
     """
+    check_model_bytes(folder)
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        return model_views(pycolmap.Reconstruction(str(folder)), folder)
+    except UserError:
+        raise
     except Exception as error:  # pycolmap raises what its C++ does: ValueError, RuntimeError, IndexError
         reason = str(error).splitlines()[-1] if str(error) else type(error).__name__
         raise UserError(f"{folder} cannot be read as a COLMAP model ({reason}): export it again") from None
-    return model_views(model, folder)
 
 
 def model_views(model: pycolmap.Reconstruction, folder: Path) -> Calibration:
@@ -131,7 +134,7 @@ def _read_json_view(file: Path, clip: Clip) -> CalibratedCamera:
     for key, shape in (("R", (3, 3)), ("t", (3,)), ("focal", (2,)), ("princpt", (2,))):
         try:
             parts[key] = np.array(value[key], np.float64).reshape(shape)
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise UserError(f"{file}: '{key}' is not {list(shape)} numbers: write the file again") from None
     check_rotation(parts["R"], f"{file}")
     if parts["focal"].min() <= 0:

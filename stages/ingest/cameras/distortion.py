@@ -20,6 +20,7 @@ from stages.ingest.video import Clip
 
 SAME_SHAPE = 0.02  # by how much the calibrated picture's proportions may differ from the clip's
 LEFT_ALONE = 1.0  # pixels of the stored frame; resampling would cost more than a smaller distortion
+_LARGEST = 1e12  # of a camera's numbers; beyond it sums overflow
 GRID = 33  # points a side at which distortion is measured
 
 
@@ -34,9 +35,15 @@ def for_stored_frames(
         width, height: of the stored frames, pixels.
 
     Raises:
-        UserError: the calibration is of pictures with other proportions.
+        UserError: the calibration is of pictures with other proportions, or of none.
     """
     lens = view.lens
+    numbers = (*lens.params, *np.ravel(view.rotation), *np.ravel(view.translation))
+    usable = bool((np.abs(numbers) < _LARGEST).all()) and min(lens.focal_length_x, lens.focal_length_y) > 0
+    if min(lens.width, lens.height) < 1 or not usable:
+        raise UserError(
+            f"{path} has a camera of an empty picture, or numbers that no camera has: calibrate again"
+        )
     if not _same_shape(lens.width, lens.height, clip) and _same_shape(lens.height, lens.width, clip):
         if clip.orientation.mirrored:
             raise UserError(f"{path} is of the pictures before they were mirrored: calibrate upright ones")

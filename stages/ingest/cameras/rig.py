@@ -105,7 +105,7 @@ def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
         translation = np.array(table["translation"], np.float64).reshape(3)
         bend = np.array(table.get("distortions", [0.0] * 4), np.float64).reshape(-1)
         size = [int(side) for side in np.array(table["size"]).reshape(2)]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path}: a camera's table is not complete ({error}): export it again") from None
     if table.get("fisheye"):
         raise UserError(f"{path}: fisheye lenses are not known here: give undistorted footage")
