@@ -44,7 +44,7 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ValueError(f"{name} of the avatar holds numbers that are not finite")
-    tensors["kept"] = avatar.vertex_ids
+    tensors["kept"] = avatar.vertex_ids.int()
     for place, pairs in enumerate(avatar.splits):
         tensors[f"splits.{place}"] = pairs.int()
     header = {
@@ -122,7 +122,7 @@ def _avatar_of(path: Path, body: BodyModel, header: dict[str, Any], tensors: dic
     architecture = Architecture(**{**header["architecture"], "residual_parts": parts})
     splits = [tensors[name].long() for name in sorted(tensors) if name.startswith("splits.")]
     half = header["half_precision"]
-    avatar = Avatar(body, identity, tensors["kept"], architecture, half_precision=half, splits=splits)
+    avatar = Avatar(body, identity, tensors["kept"].long(), architecture, half_precision=half, splits=splits)
     if header["completed"]:
         avatar.completion = torch.zeros(len(avatar.trust), 9)
     names = {_stored_name(name): name for name in avatar.state_dict()}
