@@ -39,6 +39,7 @@ BasesCount = Annotated[int, Field(ge=0, le=256)]
 Pixels = Annotated[int, Field(ge=0, le=8192)]
 EdgePixels = Annotated[float, Field(ge=0, le=1000)]
 Visits = Annotated[float, Field(ge=0, le=1_000_000)]
+Factor = Annotated[float, Field(ge=0, le=1e6)]
 Effort = Annotated[float, Field(gt=0, le=1000)]
 
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
@@ -208,7 +209,7 @@ class TrainSettings:
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
     scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
-    weak_smoothness: Weight = setting(
+    weak_smoothness: Factor = setting(
         10.0, "times more that smoothness counts where no frame showed enough, continuously"
     )
     hand_color: Weight = setting(0.0, "differences of the hands' colours from their mean")

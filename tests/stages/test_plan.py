@@ -125,9 +125,9 @@ def test_a_picture_of_half_the_size_halves_the_pixels_between_vertices(inputs):
 
 def test_finer_edges_call_for_more_gaussians_and_training_is_told_how_fine(inputs):
     coarse, fine = (
-        decide.decide(inputs, PlanSettings(edge_pixels=edge))["gaussians"] for edge in (100.0, 1.0)
+        decide.decide(inputs, PlanSettings(edge_pixels=edge))["gaussians"] for edge in (100.0, 0.7)
     )
-    assert fine.threshold == 1.0 and sum(fine.values) > 2 * sum(coarse.values) > 0
+    assert fine.threshold == 0.7 and sum(fine.values) > 2 * sum(coarse.values) > 0
     legs = [PARTS.index(part) for part in ("left_leg", "right_leg")]
     assert not any(fine.values[place] for place in legs)  # no frame shows them
 
