@@ -15,7 +15,7 @@ from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints
 from pipeline.detection.wholebody import inside_picture
 from pipeline.errors import UserError
-from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
+from stages.ingest.cameras.calibration import CalibratedCamera, check_rotation, pinhole_lens
 from stages.ingest.video import Clip
 
 SAME_SHAPE = 0.02  # by how much the calibrated picture's proportions may differ from the clip's
@@ -42,8 +42,9 @@ def for_stored_frames(
     usable = bool((np.abs(numbers) < _LARGEST).all()) and min(lens.focal_length_x, lens.focal_length_y) > 0
     if min(lens.width, lens.height) < 1 or not usable:
         raise UserError(
-            f"{path} has a camera of an empty picture, or numbers that no camera has: calibrate again"
+            f"{path} has a camera of an empty picture, or numbers that no lens has: calibrate again"
         )
+    check_rotation(view.rotation, str(path))
     if not _same_shape(lens.width, lens.height, clip) and _same_shape(lens.height, lens.width, clip):
         if clip.orientation.mirrored:
             raise UserError(f"{path} is of the pictures before they were mirrored: calibrate upright ones")

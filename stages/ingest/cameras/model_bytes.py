@@ -1,7 +1,7 @@
 """Counts in COLMAP's binary files, held against the files' lengths before pycolmap believes them.
 
-pycolmap reads as many entries as a count says, past the file's end too: one wrong byte keeps it busy for ever.
-The layout is that of COLMAP's ``reconstruction_io_binary.cc``: little-endian, without padding.
+pycolmap reads as many entries as a count says, past the file's end too: one wrong byte keeps it busy for
+ever. The layout is that of COLMAP's ``reconstruction_io_binary.cc``: little-endian, without padding.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _points_end(content: bytes, count: int) -> int:
 
 
 def _rigs_end(content: bytes, count: int) -> int:
-    """Each: id and count of sensors; the first is of 8 bytes, the others of 9 and, where said, a pose of 56."""
+    """Each: id and count of sensors; the first of 8 bytes, the others of 9 and, where said, a pose of 56."""
     at = 8
     for _ in range(count):
         sensors = _count(content, at + 4, "<I")

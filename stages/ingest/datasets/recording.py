@@ -113,7 +113,17 @@ def numbers(value: Any, shape: tuple[int, ...], where: str, remedy: str) -> np.n
         raise UserError(f"{where} is not {list(shape)} numbers: {remedy}") from None
     if not np.isfinite(array).all():
         raise UserError(f"{where} is not finite: {remedy}")
+    if not array.size and -1 in shape:
+        raise UserError(f"{where} is empty: {remedy}")
     return array
+
+
+def stacked(arrays: Sequence[np.ndarray], where: Path | str, remedy: str, axis: int = 0) -> np.ndarray:
+    """Arrays of one shape as one; UserError where they differ, as files of several programs do."""
+    if len({array.shape for array in arrays}) > 1:
+        lengths = ", ".join(sorted({str(list(array.shape)) for array in arrays})[:4])
+        raise UserError(f"{where}: numbers that belong together have the shapes {lengths}: {remedy}")
+    return np.stack(arrays, axis=axis)
 
 
 def entry(table: Any, key: str, where: Path | str, remedy: str) -> Any:

@@ -27,7 +27,7 @@ from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_pickle
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, pinhole_lens
-from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array
+from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array, stacked
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import VIDEOS, open_clip
@@ -89,7 +89,10 @@ def _poses(table: Any, path: Path) -> InitialPoses:
     rotation = np.zeros((count, 55, 3))
     for key, width, joint in _PARTS:
         rotation[:, joint : joint + width // 3] = number(key, width).reshape(count, -1, 3)
-    hands = np.stack([number(f"{side}_hand_pose", -1) for side in ("left", "right")], axis=1)
-    transl = number("transl", 3) + read_array(table, "camera_transl", (-1, 3), path, _REMEDY)
+    hands = stacked([number(f"{side}_hand_pose", -1) for side in ("left", "right")], path, _REMEDY, axis=1)
+    camera = read_array(table, "camera_transl", (-1, 3), path, _REMEDY)
+    if len(camera) not in (1, count):
+        raise UserError(f"{path}, 'camera_transl' is neither of one frame nor of {count}: {_REMEDY}")
+    transl = number("transl", 3) + camera
     expression, betas = number("expression", -1), read_array(table, "betas", (-1,), path, _REMEDY)
     return initial_poses(range(count), rotation, expression, betas, transl, hands=hands)

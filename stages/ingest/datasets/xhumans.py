@@ -37,6 +37,7 @@ from stages.ingest.datasets.recording import (
     numbers,
     pinhole_of_matrix,
     read_array,
+    stacked,
 )
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
@@ -105,15 +106,18 @@ def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPos
         turn, shift = cameras[frame]
         root = turn @ Rotation.from_rotvec(rotation[row, 0]).as_matrix()
         rotation[row, 0] = Rotation.from_matrix(root).as_rotvec()
-        columns["hands"].append(np.stack([number(f"{side}_hand_pose", -1) for side in ("left", "right")]))
+        hands = [number(f"{side}_hand_pose", -1) for side in ("left", "right")]
+        columns["hands"].append(stacked(hands, path, _REMEDY))
         columns["expression"].append(number("expression", -1))
         columns["betas"].append(number("betas", -1))
         columns["transl"].append(np.stack([number("transl", 3), shift]))
-    hands, transl = np.stack(columns["hands"]), np.stack(columns["transl"])
+    folder = next(iter(known.values())).parent
+    joined = {name: stacked(arrays, folder, _REMEDY) for name, arrays in columns.items()}
+    transl = joined["transl"]
     place = _place(transl[:, 0], transl[:, 1], np.stack([cameras[frame][0] for frame in known]))
-    betas = np.median(np.stack(columns["betas"]), axis=0)
-    expression = np.stack(columns["expression"])
-    return initial_poses(list(known), rotation, expression, betas, place, np.array(ROOT), hands)
+    betas = np.median(joined["betas"], axis=0)
+    root = np.array(ROOT)
+    return initial_poses(list(known), rotation, joined["expression"], betas, place, root, joined["hands"])
 
 
 def _place(transl: np.ndarray, shift: np.ndarray, turns: np.ndarray) -> np.ndarray:
