@@ -391,3 +391,14 @@ def test_the_sfm_setting_falls_back_where_there_is_nothing_to_follow(
     output = ingest(material, cameras="sfm", background=False)
     assert "a static pinhole takes their place" in capsys.readouterr().out
     assert read_footage(output / "footage.json").camera["source"] == "pinhole"
+
+
+def test_a_binary_model_that_says_more_than_it_holds_is_refused_at_once(tmp_path: Path) -> None:
+    """pycolmap would read 2^63 entries past the end."""
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        folder = write_colmap(tmp_path / name, ["0.png", "1.png"], binary=True)
+        assert open_calibration(str(folder), "", clip_of()) is not None
+        path = folder / f"{name}.bin"
+        path.write_bytes((2**63).to_bytes(8, "little") + path.read_bytes()[8:])
+        with pytest.raises(UserError, match=rf"{name}\.bin is damaged or cut off"):
+            open_calibration(str(folder), "", clip_of())
