@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.avatar import Architecture, Avatar, ClipConditions, pose_features
 from pipeline.avatar.bake import bake
+from pipeline.avatar.density import project_surface
 from pipeline.body import Pose, draw_mesh, load_body, mean_identity
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.config.workspace import open_workspace
@@ -42,6 +43,7 @@ def take_step(sizes: Architecture) -> None:
     theta = torch.stack([pose_features(one) for one in rotation])
     avatar.representation.set_clip(ClipConditions(theta, expression, (0.0, 1.0)))
     pose, camera = Pose(rotation[0], expression[0], torch.tensor(TRANSL)), facing_camera(SIDE, SIDE, SIDE)
+    project_surface(avatar.surface(), [(pose, camera)])  # normals, as for the density and the evidence
     for rows in (None, torch.arange(100)):  # of all Gaussians, and of those that a frame shows
         learn(avatar, pose, camera, rows)
     with torch.no_grad():
