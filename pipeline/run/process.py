@@ -86,9 +86,9 @@ class StageProcess:
         return None
 
     def close(self) -> None:
-        """Ends one that waits and is not needed."""
-        with contextlib.suppress(BrokenPipeError):
-            self._process.communicate(b"")
+        """Ends one that waits and is not needed; it may still be loading its code, which nobody waits for."""
+        self._process.kill()
+        self._process.communicate()
         self._folder.cleanup()
 
 

@@ -253,7 +253,8 @@ class TrainingObjective:
             rows = self.visibility_cache.visible_rows(draw.frame, level, count, surface.rows)
         posed = self.avatar.pose(decoded, pose, draw.noise, draw.time, rows)
         rendering = render(posed.gaussians, view.camera)
-        self.visibility_cache.record(draw.frame, level, rendering.weights, surface.rows)
+        if self.settings.pose_seen_only:
+            self.visibility_cache.record(draw.frame, level, rendering.weights, surface.rows)
         self.on_frame(pose, view)
         return RenderedFrame(
             decoded=decoded,

@@ -181,7 +181,8 @@ class TrainSettings:
     # Objective
     l1: Weight = setting(0.8, "lambda_L1")
     ssim: Weight = setting(0.2, "lambda_ssim")
-    # Bases: a tenth to a quarter less LPIPS for 0.05 dB. The triplane: 0.6 dB on smile (docs/results.md).
+    # Bases: nothing to a quarter less LPIPS, for 0.04 to 0.18 dB (docs/log/2026-11.md). The triplane loses
+    # 0.6 dB on smile.
     lpips: Weight = setting(0.05, "lambda_lpips; the paper's is 0.2")
     lpips_network: LpipsNetwork = setting("alex", "its backbone; vgg is twenty times as dear on a CPU")
     lpips_every: Count = setting(2, "drawn frames for one that LPIPS looks at, with as many times the weight")
@@ -288,6 +289,8 @@ def settings_without_effect(settings: TrainSettings) -> tuple[str, ...]:
     """The names of settings that differ from their defaults and that the representation does not read."""
     usual = TrainSettings()
     ignored = IGNORED[settings.representation]
+    if settings.representation == "bases" and settings.edge_pixels != 0:
+        ignored = (*ignored, "subdivisions")  # edges are split instead, unless the plan's decision is off
     return tuple(name for name in ignored if getattr(settings, name) != getattr(usual, name))
 
 
