@@ -70,7 +70,9 @@ def read_expressions(body_file: Path, count: int) -> Expressions:
         with np.load(body_file, allow_pickle=False) as archive:
             names = archive[_UNITS].tolist() if _UNITS in archive.files else []
     except (OSError, EOFError, ValueError, TypeError, AttributeError, BadZipFile) as error:
-        raise UserError(f"{body_file}: the names of its expressions cannot be read ({error}): get it again") from None
+        raise UserError(
+            f"{body_file}: the names of its expressions cannot be read ({error}): get it again"
+        ) from None
     usable = isinstance(names, list) and len(names) == count == len(set(map(str, names)))
     if not usable or not all(isinstance(name, str) for name in names):
         return Expressions(tuple(f"expression_{place:02d}" for place in range(count)), torch.eye(count))

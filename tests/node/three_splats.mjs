@@ -19,5 +19,5 @@ const bytes = fs.readFileSync(file);
 const { scene } = await loader.parseAsync(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length), "");
 let splats;
 scene.traverse((object) => (splats = object.isGaussianSplat ? object : splats));
-const attributes = Object.entries(splats.geometry.attributes);
+const attributes = Object.entries(splats.splatGeometry.attributes);
 console.log(JSON.stringify(Object.fromEntries(attributes.map(([name, one]) => [name, Array.from(one.array)]))));
