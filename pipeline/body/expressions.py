@@ -1,10 +1,10 @@
 """Expressions by name: what each does to the body's coefficients.
 
-The open body's file names its face units as ARKit does, but for one thing: a unit that ARKit has for the left and
-the right side is stored as both together and as left without right, ``mouthSmile`` and
-``mouthSmileLeftMinusRight``. Here they are ``mouthSmileLeft`` and ``mouthSmileRight`` again. What ARKit has and
-no coefficient does is the skeleton's: ``jawOpen`` and its like turn the joint jaw, ``eyeLookInLeft`` and its like
-the joints left_eye and right_eye; ``mouthClose`` and ``tongueOut`` do not exist.
+The open body's file names its face units as ARKit does, but for one thing: a unit that ARKit has for the left
+and the right side is stored as both together and as left without right, ``mouthSmile`` and
+``mouthSmileLeftMinusRight``. Here they are ``mouthSmileLeft`` and ``mouthSmileRight`` again. What ARKit has
+and no coefficient does is the skeleton's: ``jawOpen`` and its like turn the joint jaw, ``eyeLookInLeft`` and
+its like the joints left_eye and right_eye; ``mouthClose`` and ``tongueOut`` do not exist.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def read_expressions(body_file: Path, count: int) -> Expressions:
     """The expressions of a body's file.
 
     Args:
-        body_file: ``open_body.npz``, or an official file; what names no units has ``expression_00`` and so on,
-            of which weight 1 is one coefficient of 1.
+        body_file: ``open_body.npz``, or an official file; what names no units has ``expression_00`` and so
+            on, of which weight 1 is one coefficient of 1.
         count: of the body's coefficients, E.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Building a binary glTF 2.0 file (``.glb``): arrays to accessors, one buffer. Nodes and the rest are pygltflib's."""
+"""Building a binary glTF 2.0 file (``.glb``): arrays to accessors, one buffer; the rest is pygltflib's."""
 
 from __future__ import annotations
 

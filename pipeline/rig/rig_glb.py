@@ -1,7 +1,7 @@
 """A rigged mesh as a ``.glb`` file: skeleton, skin, colours, expressions as morph targets.
 
-The material is unlit (KHR_materials_unlit), for the clip's light is in its colours already; programs that do not
-know the extension light it as a matt surface.
+The material is unlit (KHR_materials_unlit), for the clip's light is in its colours already; programs that do
+not know the extension light it as a matt surface.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The body of one person as glTF wants a skinned mesh: a vertex a corner of the texture, few joints a vertex."""
+"""The body of one person as glTF wants a skinned mesh: seams of the texture cut, few joints a vertex."""
 
 from __future__ import annotations
 
@@ -71,13 +71,14 @@ class RiggedMesh:
 def rigged_mesh(
     body: BodyModel, identity: Identity, expressions: Expressions, shown: Tensor | None = None
 ) -> RiggedMesh:
-    """The mesh of one person. Pose correctives, where the body has them, are left out: glTF has no word for them.
+    """The mesh of one person, without the body's pose correctives: glTF has no word for them.
 
     Args:
         body: the body model.
         identity: the person's.
         expressions: those that become morph targets.
-        shown: [V] bool, the vertices that are wanted; a triangle stays if all of its corners are. All if None.
+        shown: [V] bool, the vertices that are wanted; a triangle stays if all of its corners are. All if
+            None.
     """
     rest = rest_vertices(body, identity)
     normals = vertex_normals(rest, body.faces)

@@ -1,8 +1,8 @@
 """Gaussians as a ``.glb`` file with KHR_gaussian_splatting, the extension that Khronos ratified.
 
-A mesh of points with the attributes ROTATION (x, y, z, w), SCALE (metres), OPACITY (in [0, 1]) and the constant
-term of spherical harmonics; ``COLOR_0`` shows the points in programs that do not know the extension. The axes
-are glTF's, which are ours: Y up, the person faces +Z.
+A mesh of points with the attributes ROTATION (x, y, z, w), SCALE (metres), OPACITY (in [0, 1]) and the
+constant term of spherical harmonics; ``COLOR_0`` shows the points in programs that do not know the extension.
+The axes are glTF's, which are ours: Y up, the person faces +Z.
 """
 
 from __future__ import annotations

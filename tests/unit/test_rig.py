@@ -24,7 +24,8 @@ from tests.node import run_script
 ARKIT = {  # Apple's blend shapes of a face that are not the jaw's, the eyes' or the tongue's turns
     *(f"{name}{side}" for side in ("Left", "Right") for name in (
         "browDown", "browOuterUp", "cheekSquint", "eyeBlink", "eyeSquint", "eyeWide", "mouth", "mouthDimple",
-        "mouthFrown", "mouthLowerDown", "mouthPress", "mouthSmile", "mouthStretch", "mouthUpperUp", "noseSneer",
+        "mouthFrown", "mouthLowerDown", "mouthPress", "mouthSmile", "mouthStretch", "mouthUpperUp",
+        "noseSneer",
     )),
     *("browInnerUp", "cheekPuff", "mouthFunnel", "mouthPucker", "mouthRollLower", "mouthRollUpper",
       "mouthShrugLower", "mouthShrugUpper"),
