@@ -36,7 +36,7 @@ class SurfaceColors:
     colors: np.ndarray
 
     def at(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Colours at other places: [N, 3] with unit normals [N, 3] -> [N, 3] float32; grey if none is known."""
+        """Colours at other places: [N, 3] with unit normals [N, 3] -> [N, 3] float32; grey if none is."""
         known = np.isfinite(np.column_stack([self.places, self.normals, self.colors])).all(1)
         if not known.any():
             return np.full((len(places), 3), _GREY, np.float32)
