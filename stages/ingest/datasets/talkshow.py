@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.choices import VIDEOS
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_pickle
@@ -30,7 +31,7 @@ from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Cal
 from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array, stacked
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import VIDEOS, open_clip
+from stages.ingest.video import open_clip
 
 _REMEDY = "take SHOW's .pkl again, or leave it out"
 _PARTS = (  # key -> numbers a frame, the joint it begins at
