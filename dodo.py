@@ -229,9 +229,9 @@ def stage_task(stage: str, subject: str) -> dict:
         "name": subject,
         "doc": f"{stage} of {subject}",
         "task_dep": [
+            *needed_of_others(stage, subject),
             *(f"{upstream}:{subject}" for upstream in STAGES[stage].needs),
             *(f"assets:{name}" for name in needed_assets(stage, subject)),
-            *needed_of_others(stage, subject),
         ],
         "uptodate": [functools.partial(is_current, stage, subject)],
         "actions": [(run_stage, [stage, subject])],
