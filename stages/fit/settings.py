@@ -37,7 +37,7 @@ class FitSettings:
 
     # Where it starts
     face: Literal["auto", "mesh", "flame", "off"] = setting(
-        "auto", "the face that is fitted first: the estimator's mesh, FLAME's, none, or as there is"
+        "auto", "the face that is fitted first: the estimator's (its mesh, or its 68 points), FLAME's, none"
     )
     face_init: str = setting("", "folder of DECA's flame_params/ and shape_param.json, for face=flame")
     flame_model: str = setting("", "FLAME model file of the user's own, for face=flame")
