@@ -48,7 +48,7 @@ class Term(Generic[Source]):
         loss: what is computed; its values are unreduced.
         of: its arguments; the term is left out where one of them is None.
         weight: the setting that weighs it.
-        hands, face: the settings that weigh it on these parts instead, a vertex at a time.
+        hands, face, scalp: the settings that weigh it on these parts instead, a vertex at a time.
         smooths: it counts more, a vertex at a time, where evidence of what it smooths is weak: "color" or
             "shape"; not at all differently if empty.
         generated: the setting that weighs it on generated frames instead.
@@ -66,6 +66,7 @@ class Term(Generic[Source]):
     weight: str
     hands: str = ""
     face: str = ""
+    scalp: str = ""
     smooths: str = ""
     generated: str = ""
     captured_only: bool = False
@@ -77,17 +78,18 @@ class Term(Generic[Source]):
     @property
     def by_part(self) -> bool:
         """True where each vertex has the weight of its body part."""
-        return bool(self.hands or self.face)
+        return bool(self.hands or self.face or self.scalp)
 
     @property
     def weights(self) -> tuple[str, ...]:
         """The settings that weigh it on captured frames."""
-        return tuple(name for name in (self.weight, self.hands, self.face) if name)
+        return tuple(name for name in (self.weight, self.hands, self.face, self.scalp) if name)
 
     def part_weights(self, settings: TrainSettings) -> PartWeights:
-        """The weights on hands, face and elsewhere."""
-        hands, face = (getattr(settings, name or self.weight) for name in (self.hands, self.face))
-        return hands, face, getattr(settings, self.weight)
+        """The weights on hands, face, scalp and elsewhere."""
+        names = (self.hands, self.face, self.scalp, self.weight)
+        hands, face, scalp, elsewhere = (getattr(settings, name or self.weight) for name in names)
+        return hands, face, scalp, elsewhere
 
     def scalar_weight(self, settings: TrainSettings, generated: bool) -> float:
         """The factor of its weighted mean; 1 where vertices have weights of their own."""
@@ -130,7 +132,7 @@ FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
     Term("laplacian_color", losses.laplacian, lambda f: (f.colors, f.neighbours),
          "laplacian_color", hands="laplacian_color_hands", smooths="color", mask=lambda f: f.unmixed),
     Term("scale_size", losses.l2, lambda f: (f.posed.gaussians.scales,),
-         "scale_size", hands="scale_size_hands"),
+         "scale_size", hands="scale_size_hands", face="scale_size_face"),
     Term("scale_shrink", losses.scale_shrink, lambda f: (f.posed.log_scale,), "scale_shrink"),
     Term("scale_growth", losses.scale_growth, lambda f: (f.posed.log_scale,), "scale_growth"),
     Term("hand_color", losses.color_variance, lambda f: (f.regions.on_hands(f.colors),), "hand_color"),
@@ -152,7 +154,7 @@ STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
     Term("laplacian_offset", losses.laplacian, lambda s: (s.decoded.offset, s.neighbours),
          "laplacian_offset", face="laplacian_offset_face", smooths="shape"),
     Term("offset", losses.l2, lambda s: (s.decoded.offset,), "offset", hands="offset_hands",
-         face="offset_face"),
+         face="offset_face", scalp="offset_scalp"),
     Term("hand_normal", losses.outward_offset,
          lambda s: (s.regions.on_hands(s.decoded.offset), s.regions.on_hands(s.normals)), "hand_normal"),
 )

@@ -204,10 +204,12 @@ class TrainSettings:
     offset: Weight = setting(10.0, "size of static offsets, metres squared")
     offset_hands: Weight = setting(1000.0, "the same on the hands")
     offset_face: Weight = setting(10.0, "the same on the face")
+    offset_scalp: Weight = setting(10.0, "the same on the head without the face")
     pose_offset: Weight = setting(50.0, "size of pose-dependent offsets, metres squared")
     hand_normal: Weight = setting(0.0, "static offsets of the hands that point outwards")
     scale_size: Weight = setting(0.0, "size of scales, metres squared")
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
+    scale_size_face: Weight = setting(0.0, "the same on the face")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
     scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
     weak_smoothness: Factor = setting(

@@ -135,7 +135,9 @@ def test_face_triangles_are_those_of_the_face(canonical):
 
 
 def test_weights_follow_the_parts(canonical):
-    settings = TrainSettings(offset=1.0, offset_hands=2.0, offset_face=3.0, laplacian_color_hands=4.0)
+    settings = TrainSettings(
+        offset=1.0, offset_hands=2.0, offset_face=3.0, offset_scalp=5.0, laplacian_color_hands=4.0
+    )
     terms = {term.name: term for term in objective.TERMS}
     weights = {
         name: body_regions.weight_by_part(canonical, *terms[name].part_weights(settings))
@@ -144,7 +146,9 @@ def test_weights_follow_the_parts(canonical):
     hands, face = canonical.is_part("left_hand", "right_hand"), canonical.is_part("face")
     assert set(weights["offset"][hands].flatten().tolist()) == {2.0}
     assert set(weights["offset"][face].flatten().tolist()) == {3.0}
-    assert set(weights["offset"][~hands & ~face].flatten().tolist()) == {1.0}
+    scalp = canonical.is_part("head")
+    assert set(weights["offset"][scalp].flatten().tolist()) == {5.0}
+    assert set(weights["offset"][~hands & ~face & ~scalp].flatten().tolist()) == {1.0}
     assert set(weights["laplacian_color"][hands].flatten().tolist()) == {4.0}
     assert body_regions.find_regions(canonical, {}, arms=False).undersides is None
 

@@ -1,8 +1,8 @@
 """One face in every frame: where the head is, how far the mouth is open, and the expression.
 
 Gauss-Newton on the face's points (478 of a mesh, or 68 without depth) as they are seen through the frame's
-own pinhole, all frames of a chunk at once. Unknown in a frame are the head's rotation R and place t in the camera's axes, the jaw's
-angle a about its hinge (X), psi, and the origin of the estimator's depths:
+own pinhole, all frames of a chunk at once. Unknown in a frame are the head's rotation R and place t in the
+camera's axes, the jaw's angle a about its hinge (X), psi, and the origin of the estimator's depths:
 
     y_i = B_i(a) (n_i + E_i psi - j) + j,   B_i(a) = 1 + w_i (R_x(a) - 1)
     pixel_i = project(R y_i + t),           depth_i = gain * focal * (R y_i + t)_z / distance + origin
