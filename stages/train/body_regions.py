@@ -1,4 +1,4 @@
-"""Body regions that regularisers weigh apart: hands, face, scalp, undersides of arms (Section 3.6, supplement D).
+"""Body regions that regularisers weigh apart: hands, face, scalp, undersides of arms (Section 3.6, D).
 
 What is regularised is what is rendered. ExAvatar also renders and regularises the avatar without its
 pose-dependent part; the paper's Equation 9 does not, and neither does this. The terms on joint offsets

@@ -194,11 +194,18 @@ class TrainSettings:
     generated_every: Count = setting(5, "draws for one of a generated frame; the paper's is 2, equally often")
     generated: Weight = setting(0.1, "lambda_L1, lambda_ssim and lambda_lpips on generated frames")
 
+    # ExAvatar renders a frame several times and compares each rendering: docs/paper.md counts.
+    l1_renderings: Factor = setting(1.0, "renderings of a captured frame that lambda_L1 stands for")
+    renderings: Factor = setting(1.0, "the same of SSIM, LPIPS, face, and all of generated frames")
+
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: Weight = setting(1e3, "smoothness of static and of all offsets together")
     laplacian_offset_face: Weight = setting(1e3, "the same on the face")
-    laplacian_scale: Weight = setting(0.02, "smoothness of log scales")
+    laplacian_scale: Weight = setting(0.02, "smoothness of scales")
     laplacian_scale_face: Weight = setting(0.02, "the same on the face")
+    scale_smoothness: Literal["relative", "metres"] = setting(
+        "relative", "scales whose smoothness that is: logarithms of multiples of the first ones, or metres"
+    )
     laplacian_color: Weight = setting(0.002, "smoothness of colours")
     laplacian_color_hands: Weight = setting(0.002, "the same on the hands")
     offset: Weight = setting(10.0, "size of static offsets, metres squared")
@@ -210,6 +217,9 @@ class TrainSettings:
     scale_size: Weight = setting(0.0, "size of scales, metres squared")
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
     scale_size_face: Weight = setting(0.0, "the same on the face")
+    pose_scale: Weight = setting(0.0, "size of pose-dependent changes of log scales")
+    pose_scale_hands: Weight = setting(0.0, "the same on the hands")
+    pose_scale_face: Weight = setting(0.0, "the same on the face")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
     scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
     weak_smoothness: Factor = setting(

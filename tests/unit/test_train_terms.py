@@ -174,6 +174,8 @@ def test_lpips_is_asked_for_only_where_it_has_a_weight():
 
 def test_every_weight_of_the_settings_weighs_a_term():
     named = {name for term in objective.TERMS for name in (*term.weights, term.generated) if name}
+    counts = {term.times for term in objective.TERMS if term.times}
+    assert counts == {"l1_renderings", "renderings"}
     weights = {field.name for field in dataclasses.fields(TrainSettings) if field.type in ("Weight", Weight)}
     assert named == weights and len({term.name for term in objective.TERMS}) == len(objective.TERMS)
 
@@ -195,6 +197,8 @@ def test_terms_take_part_from_their_iteration_on_and_in_every_kth_draw():
     ]
     assert lpips.scalar_weight(settings, False) == pytest.approx(0.6)
     assert lpips.scalar_weight(settings, True) == pytest.approx(3 * settings.generated)
+    often = dataclasses.replace(settings, l1_renderings=6.5, renderings=2.0)
+    assert [terms["l1"].scalar_weight(often, made) for made in (False, True)] == [0.8 * 6.5, 0.1 * 2]
     assert terms["pose_offset"].first_iteration(settings) is None  # 1 stands for never
     assert terms["hand_normal"].first_iteration(settings) is None  # no weight
     weighted = TrainSettings(face=0.8)
