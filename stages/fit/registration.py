@@ -78,6 +78,8 @@ def register(
     Raises:
         UserError: a frame has no camera, or there are no frames.
     """
+    directions = body.expression_directions[..., : settings.expressions]
+    body = dataclasses.replace(body, expression_directions=directions)
     views = views_of(keypoints, cameras)
     keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
     size = views.size.numpy()

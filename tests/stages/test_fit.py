@@ -151,6 +151,16 @@ def test_whole_body_points_alone_are_enough(model, clip):
     assert error[~error.isnan()].mean() < 2.0
 
 
+def test_expressions_are_as_many_as_the_setting_says(model):
+    clip = make_clip(*model, count=2, face=True)
+    fitted = register(*model, clip.keypoints, clip.cameras, FitSettings(iterations=1, expressions=7))
+    assert fitted.poses.expression.shape == (2, 7)
+    posed = pose_body(
+        model[0], fitted.identity, *(getattr(fitted.poses, n) for n in ("rotation", "expression", "transl"))
+    )
+    assert torch.isfinite(posed[0]).all()
+
+
 def test_whole_body_points_alone_have_a_face_to_align_with(model):
     """L_sface is active, and the face counts as registered, without any face mesh."""
     near = dataclasses.replace(make_clip(*model, count=4), poses=true_poses((3, 4, 5, 6), distance=1.6))
