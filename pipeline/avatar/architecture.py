@@ -12,6 +12,7 @@ class Architecture:
     Attributes:
         plane_resolution: texels along a side of each plane.
         plane_channels: features a texel; three planes give ``f_i`` three times as many.
+        plane_deviation: standard deviation of the first features; of the start alone, a file does not hold it.
         width: hidden channels of the heads.
         groups: of GroupNorm in the heads.
         subdivisions: levels of midpoint subdivision of the body mesh.
@@ -48,3 +49,4 @@ class Architecture:
     residual_moves: bool = False
     representation: str = "triplane"
     bases: int = 0
+    plane_deviation: float = 0.01

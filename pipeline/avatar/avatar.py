@@ -47,6 +47,7 @@ class Avatar(nn.Module):
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
+        residual_share: the share of their colours that is added; less than 1 while they come in.
         at_once: posed in one pass over the Gaussians where that can be (``fused_posing.py``), else step by
             step, which gives the same.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
@@ -92,7 +93,7 @@ class Avatar(nn.Module):
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
-        self.at_once = True
+        self.residual_share, self.at_once = 1.0, True
         self.splits = tuple(splits)
         if self.splits:
             meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
@@ -279,6 +280,7 @@ class Avatar(nn.Module):
             answer = self.representation.residual(decoded, means, condition, rows)
         if answer is not None:
             answer = answer if share is None else scaled_residual(answer, share)
+            answer = answer if self.residual_share == 1 else answer * self.residual_share
             residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(

@@ -72,6 +72,7 @@ def _described(architecture: Architecture) -> dict:
     sizes = dataclasses.asdict(architecture)
     if not architecture.residual_moves:
         del sizes["residual_moves"]
+    del sizes["plane_deviation"]
     if architecture.representation == "triplane":
         del sizes["representation"], sizes["bases"]
     return sizes

@@ -20,6 +20,7 @@ import pandas as pd
 from pipeline.config.request import Request
 from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
+from pipeline.run.job import open_job
 from pipeline.run.progress import Progress
 from pipeline.store.artifact import read_manifest
 from pipeline.studies.measure import AvatarMeter, Numbers, score_table
@@ -135,7 +136,7 @@ def run_all(
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
-                bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
+                bases[subject] = base_of(subject, request, log, views_of(subject, request))
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
@@ -145,6 +146,12 @@ def run_all(
                 print(results[subject, key].line, flush=True)
                 progress.advance(1, variant.name)
     return bases, results
+
+
+def views_of(subject: str, request: Request) -> Mapping[str, str]:
+    """The overrides that give the whole method generated views where its settings leave them out."""
+    auxiliary = open_job(subject, request).settings["auxiliary"]
+    return {"auxiliary.generator": "auto"} if auxiliary.generator == "off" else {}
 
 
 def speeds_of(bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result]) -> dict[Path, Numbers]:

@@ -52,7 +52,7 @@ IGNORED = {
         "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
         "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
         "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
-        "time_frequencies", "time_dropout", "learning_rate", "plane_learning_rate",
+        "time_frequencies", "time_dropout", "residual_ramp", "plane_deviation", "learning_rate", "plane_learning_rate",
     ),
 }  # fmt: skip
 """The settings that a representation does not read."""
@@ -107,6 +107,7 @@ class TrainSettings:
     subdivide_from: Fraction = setting(0.5, "fraction of the run before which the mesh stays unsubdivided")
     plane_resolution: Texels = setting(128, "texels along a side of each plane")
     plane_channels: Channels = setting(32, "features a texel")
+    plane_deviation: Deviation = setting(0.01, "standard deviation of the planes' first features")
     width: Channels = setting(128, "hidden channels of the heads")
     groups: Channels = setting(8, "of the heads' GroupNorm; must divide width")
     offset_unit: Metres = setting(0.04, "metres that a static offset of 1 stands for")
@@ -134,12 +135,13 @@ class TrainSettings:
 
     # Residual colours (Section 3.5). A part that the plan does not name gets no head.
     residual_parts: tuple[ResidualPart, ...] = setting(
-        ("face", "left_hand", "right_hand"), "parts with a residual head; rest: the authors' fourth net"
+        ("face", "left_hand", "right_hand"), "parts with a residual head; rest: the whole body, an ablation"
     )
     residual_moves: bool = setting(False, "move Gaussians, too: the ablation of the paper's supplement E.3")
     residual_from: Fraction = setting(
         0.5, "fraction of the run from which the residual heads take part; 1: never"
     )
+    residual_ramp: Fraction = setting(0.0, "fraction of the run over which their colours come in evenly")
     residual_width: Channels = setting(64, "hidden channels; the authors' release has 256")
     residual_place: ResidualPlace = setting(
         "canonical", "what they are told of a Gaussian's place; posed: in the world"
@@ -158,6 +160,9 @@ class TrainSettings:
     gate_threshold: Threshold | None = setting(
         None, "scores below are gated; none: found in the scores (Otsu)"
     )
+    gate_rule: Literal["evidence", "otsu"] = setting(
+        "evidence", "Otsu's threshold only where little of what is seen goes with it, or as it is"
+    )
     gate_rings: Rings = setting(2, "rings of neighbours added to what is left")
     unseen: Literal["completed", "generated", "base", "nothing"] = setting(
         "completed",
@@ -172,11 +177,16 @@ class TrainSettings:
     scale_learning_rate: LearningRate = setting(0.01, "likewise: log scales")
     offset_learning_rate: LearningRate = setting(0.01, "likewise: static offsets, in offset_unit")
     bases_learning_rate: LearningRate = setting(0.002, "likewise: the linear bases")
+    schedule: Literal["cosine", "steps"] = setting(
+        "cosine", "of the rates; steps: a tenth after 75% of the run and a hundredth after 95%"
+    )
     final_rate: Fraction = setting(0.05, "the cosine schedule's last factor")
+    adam_beta2: Fraction = setting(0.99, "Adam's second beta; the first is 0.9")
     warm_up: CountOrNone = setting(20, "iterations")
     refine_poses: bool = setting(True, "optimise the training frames' poses too")
     refine_from: Fraction = setting(0.15, "fraction of the run from which they move")
-    pose_learning_rate: LearningRate = setting(1e-4, "of rotations and expressions; a tenth of it for transl")
+    pose_learning_rate: LearningRate = setting(1e-4, "of rotations and expressions")
+    transl_rate: Factor = setting(0.1, "times that, for transl: a translation moves every pixel at once")
 
     # Objective
     l1: Weight = setting(0.8, "lambda_L1")
@@ -236,6 +246,10 @@ class TrainSettings:
     def _fit_together(self) -> TrainSettings:
         if self.subdivisions and self.subdivide_from == 1:
             raise ValueError("train.subdivide_from must be less than 1, or train.subdivisions 0")
+        if self.residual_from < 1 and self.residual_from + self.residual_ramp > 1:
+            raise ValueError("train.residual_from and train.residual_ramp must add up to at most 1")
+        if self.adam_beta2 == 1:
+            raise ValueError("train.adam_beta2 must be less than 1")
         if self.width % self.groups:
             raise ValueError(f"train.groups must divide train.width, {self.width}, not be {self.groups}")
         if self.residual_width % self.groups:

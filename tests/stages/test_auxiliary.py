@@ -277,6 +277,11 @@ def test_off_costs_nothing(full, tmp_path):
 def test_auto_goes_by_the_plan(full, tmp_path):
     context = context_for(full, tmp_path / "auto", generator="auto")
     assert stage.chosen_generator(context) == "texture"
+    for named, generator in (({"weights": "w"}, "mimicmotion"), ({"folder": "f"}, "folder")):
+        context = context_for(full, tmp_path / "named", generator="named", **named)
+        assert stage.chosen_generator(context) == generator
+    with pytest.raises(UserError, match="auxiliary.weights"):
+        stage.run(context_for(full, tmp_path / "nothing", generator="named"))
     quick = context_for(full, tmp_path / "quick")  # leaves them out, and says what would make them
     assert stage.chosen_generator(quick) == "off" and "auxiliary.generator=auto" in quick.logged[-1]
     shutil.copytree(full / "plan", tmp_path / "plan")
