@@ -95,7 +95,7 @@ def named_generator(settings: AuxiliarySettings) -> str:
         return "mimicmotion"
     raise UserError(
         "generated views are asked for, and none can be made: name the folder of MimicMotion's weights as "
-        "auxiliary.weights=FOLDER or frames made elsewhere as auxiliary.folder=FOLDER_OR_VIDEO, take those of "
+        "auxiliary.weights=FOLDER or frames made elsewhere as auxiliary.folder=FOLDER_OR_VIDEO, take "
         "auxiliary.generator=texture, or go without them: auxiliary.generator=off"
     )
 

@@ -226,13 +226,19 @@ class Trainer:
 def _optimizers(
     avatar: Avatar, poses: PoseRefinement, settings: TrainSettings
 ) -> tuple[torch.optim.Adam, torch.optim.Adam]:
-    """One optimiser for the avatar and one for the poses; ``base_rate`` is what the schedule scales."""
+    """One optimiser for the avatar, one for poses and identity; ``base_rate`` is what the schedule scales."""
     groups = avatar.representation.parameter_groups()
+    if avatar.opacity_logit is not None:
+        groups["opacity_learning_rate"] = [avatar.opacity_logit]
     rate, beta2 = settings.pose_learning_rate, settings.adam_beta2
     angles = [*poses.rotation.parameters(), *poses.expression.parameters()]
+    identity = [] if avatar.identity_change is None else list(avatar.identity_change.parameters())
     return (
         _adam([(parameters, getattr(settings, name)) for name, parameters in groups.items()], beta2),
-        _adam([(angles, rate), (list(poses.transl.parameters()), rate * settings.transl_rate)], beta2),
+        _adam(
+            [([*angles, *identity], rate), (list(poses.transl.parameters()), rate * settings.transl_rate)],
+            beta2,
+        ),
     )
 
 

@@ -165,6 +165,8 @@ STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
          "laplacian_offset", face="laplacian_offset_face", smooths="shape"),
     Term("offset", losses.l2, lambda s: (s.decoded.offset,), "offset", hands="offset_hands",
          face="offset_face", scalp="offset_scalp"),
+    Term("joint_change", losses.l2, lambda s: (s.joint_change,), "joint_change"),
+    Term("joint_symmetry", losses.size, lambda s: (s.joint_asymmetry,), "joint_symmetry"),
     Term("hand_normal", losses.outward_offset,
          lambda s: (s.regions.on_hands(s.decoded.offset), s.regions.on_hands(s.normals)), "hand_normal"),
 )
@@ -245,7 +247,8 @@ class TrainingObjective:
             terms = self._evaluate(FRAME_TERMS, frame, iteration, position, frame.view.generated)
             for name, value in terms.items():
                 total[name] = total.get(name, torch.zeros_like(value)) + value / batch
-        static = StaticAvatar(decoded=decoded, regions=self._regions(decoded.surface))
+        identity = self.avatar.identity_change
+        static = StaticAvatar(decoded=decoded, regions=self._regions(decoded.surface), identity=identity)
         return {**total, **self._evaluate(STATIC_TERMS, static, iteration)}
 
     def draw(self, position: int) -> Draw:

@@ -8,6 +8,7 @@ from functools import cached_property
 from torch import Tensor
 
 from pipeline.avatar import Decoded, Posed
+from pipeline.avatar.identity_change import IdentityChange
 from pipeline.avatar.sparse import SparsePair
 from pipeline.clip.composite import over
 from pipeline.clip.views import View
@@ -27,10 +28,22 @@ class StaticAvatar:
     Attributes:
         decoded: the static heads' output.
         regions: of its mesh.
+        identity: what is learnt of the identity; None where nothing is.
     """
 
     decoded: Decoded
     regions: Regions
+    identity: IdentityChange | None = None
+
+    @property
+    def joint_change(self) -> Tensor | None:
+        """The change of joint offsets, see ``IdentityChange.offset_change``; None where none is learnt."""
+        return None if self.identity is None else self.identity.offset_change()
+
+    @property
+    def joint_asymmetry(self) -> Tensor | None:
+        """See ``IdentityChange.asymmetry``; None where no identity is learnt."""
+        return None if self.identity is None else self.identity.asymmetry()
 
     @property
     def neighbours(self) -> SparsePair:

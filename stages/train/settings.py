@@ -52,7 +52,8 @@ IGNORED = {
         "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
         "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
         "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
-        "time_frequencies", "time_dropout", "residual_ramp", "plane_deviation", "learning_rate", "plane_learning_rate",
+        "time_frequencies", "time_dropout", "residual_ramp", "plane_deviation", "plane_pose", "learning_rate",
+        "plane_learning_rate",
     ),
 }  # fmt: skip
 """The settings that a representation does not read."""
@@ -114,7 +115,15 @@ class TrainSettings:
     pose_offset_unit: Metres = setting(0.01, "metres that a pose-dependent offset of 1 stands for")
     scale: Size = setting(0.55, "initial standard deviation of a Gaussian, in mean edge lengths")
     thickness: Size = setting(0.5, "initial standard deviation along the normal, in those along the surface")
-    opacity: Opacity = setting(0.999, "of every Gaussian")
+    opacity: Opacity = setting(0.999, "of every Gaussian, or to begin with")
+    learn_opacity: bool = setting(False, "each Gaussian has an opacity of its own")
+    learn_identity: bool = setting(False, "betas and joint offsets move with the poses")
+    correctives: Literal["all", "face_and_hands"] = setting(
+        "all", "where the body model's pose correctives act; pose heads do not move head and hands"
+    )
+    plane_pose: Literal["own", "open"] = setting(
+        "own", "rest mesh that the planes are laid over: the person's, or the mean's, legs and mouth open"
+    )
     skinning: Literal["own", "nearest"] = setting(
         "own", "weights of the Gaussian's own vertex, or of the nearest: the one that it has come to lie at"
     )
@@ -176,6 +185,7 @@ class TrainSettings:
     color_learning_rate: LearningRate = setting(0.02, "of the bases' representation: static colours, logits")
     scale_learning_rate: LearningRate = setting(0.01, "likewise: log scales")
     offset_learning_rate: LearningRate = setting(0.01, "likewise: static offsets, in offset_unit")
+    opacity_learning_rate: LearningRate = setting(0.01, "of opacities, logits, where they are learnt")
     bases_learning_rate: LearningRate = setting(0.002, "likewise: the linear bases")
     schedule: Literal["cosine", "steps"] = setting(
         "cosine", "of the rates; steps: a tenth after 75% of the run and a hundredth after 95%"
@@ -235,6 +245,8 @@ class TrainSettings:
     weak_smoothness: Factor = setting(
         10.0, "times more that smoothness counts where no frame showed enough, continuously"
     )
+    joint_change: Weight = setting(0.0, "size of learnt joint offsets, metres squared; tenfold on the hands")
+    joint_symmetry: Weight = setting(0.0, "differences of left and right joint offsets, metres")
     hand_color: Weight = setting(0.0, "differences of the hands' colours from their mean")
     arm_color: Weight = setting(0.0, "differences of the arms' lower sides from their upper sides")
     residual_size: Weight = setting(1e-3, "size of residual colours, in logits")
@@ -322,10 +334,11 @@ def settings_without_effect(settings: TrainSettings) -> tuple[str, ...]:
 
 def learning_rates(settings: TrainSettings) -> tuple[str, ...]:
     """The names of the learning rates that are in use, the pictures' first."""
+    opacity = ("opacity_learning_rate",) if settings.learn_opacity else ()
     if settings.representation == "triplane":
-        return ("learning_rate", "plane_learning_rate", "pose_learning_rate")
+        return ("learning_rate", "plane_learning_rate", *opacity, "pose_learning_rate")
     own = ("color_learning_rate", "scale_learning_rate", "offset_learning_rate", "bases_learning_rate")
-    return (*own, "pose_learning_rate")
+    return (*own, *opacity, "pose_learning_rate")
 
 
 def subdivision_levels(plan: Plan) -> int:

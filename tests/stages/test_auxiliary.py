@@ -274,14 +274,17 @@ def test_off_costs_nothing(full, tmp_path):
     assert not list(context.output.iterdir())
 
 
-def test_auto_goes_by_the_plan(full, tmp_path):
-    context = context_for(full, tmp_path / "auto", generator="auto")
-    assert stage.chosen_generator(context) == "texture"
+def test_named_takes_what_is_named_and_nothing_in_its_place(full, tmp_path):
     for named, generator in (({"weights": "w"}, "mimicmotion"), ({"folder": "f"}, "folder")):
-        context = context_for(full, tmp_path / "named", generator="named", **named)
+        context = context_for(full, tmp_path / generator, generator="named", **named)
         assert stage.chosen_generator(context) == generator
     with pytest.raises(UserError, match="auxiliary.weights"):
         stage.run(context_for(full, tmp_path / "nothing", generator="named"))
+
+
+def test_auto_goes_by_the_plan(full, tmp_path):
+    context = context_for(full, tmp_path / "auto", generator="auto")
+    assert stage.chosen_generator(context) == "texture"
     quick = context_for(full, tmp_path / "quick")  # leaves them out, and says what would make them
     assert stage.chosen_generator(quick) == "off" and "auxiliary.generator=auto" in quick.logged[-1]
     shutil.copytree(full / "plan", tmp_path / "plan")
