@@ -39,6 +39,7 @@ VARIANTS: Mapping[str, Variant] = {
     "no_gate": Variant("without visibility gate", {"plan.visibility_gate": "off"}),
     "no_masked_fit": Variant("without masked fit", {"fit.masked": "false"}),
     "weight_1": Variant("generated views' weight 1.0", {"train.generated": "1"}),
+    "weight_equal": Variant("generated views' weights as captured", {"train.generated_as_captured": "true"}),
     "moves": Variant("residual also moves positions", {"train.residual_moves": "true"}),
     "whole_body": Variant("whole-body residual", {"train.residual_parts": "face,left_hand,right_hand,rest"}),
     "fixed_threshold": Variant(f"fixed threshold {FIXED}", {"train.gate_threshold": str(FIXED)}),

@@ -98,7 +98,7 @@ class Term(Generic[Source]):
         """The factor of its weighted mean; 1 where vertices have weights of their own."""
         if self.by_part:
             return 1.0
-        made = bool(generated and self.generated)
+        made = bool(generated and self.generated and not settings.generated_as_captured)
         weight: float = getattr(settings, self.generated if made else self.weight)
         if self.times:
             weight *= settings.renderings if made else getattr(settings, self.times)

@@ -212,6 +212,7 @@ class TrainSettings:
     lpips_from: Fraction = setting(0.5, "fraction of the run from which it takes part")
     face: Weight = setting(0.0, "lambda_face; the paper's is 0.8")
     generated_every: Count = setting(5, "draws for one of a generated frame; the paper's is 2, equally often")
+    generated_as_captured: bool = setting(False, "generated frames weigh as much as captured ones instead")
     generated: Weight = setting(0.1, "lambda_L1, lambda_ssim and lambda_lpips on generated frames")
 
     # ExAvatar renders a frame several times and compares each rendering: docs/paper.md counts.

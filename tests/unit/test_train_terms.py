@@ -199,6 +199,8 @@ def test_terms_take_part_from_their_iteration_on_and_in_every_kth_draw():
     assert lpips.scalar_weight(settings, True) == pytest.approx(3 * settings.generated)
     often = dataclasses.replace(settings, l1_renderings=6.5, renderings=2.0)
     assert [terms["l1"].scalar_weight(often, made) for made in (False, True)] == [0.8 * 6.5, 0.1 * 2]
+    equal = dataclasses.replace(settings, generated_as_captured=True)
+    assert [terms[name].scalar_weight(equal, True) for name in ("l1", "ssim")] == [0.8, 0.2]
     assert terms["pose_offset"].first_iteration(settings) is None  # 1 stands for never
     assert terms["hand_normal"].first_iteration(settings) is None  # no weight
     weighted = TrainSettings(face=0.8)
