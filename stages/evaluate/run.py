@@ -62,6 +62,7 @@ from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import summarise
 from stages.evaluate.test_pose_refinement import (
     NOT_REFINED,
+    PictureLoss,
     RefinedTestPoses,
     is_called_for,
     refine,
@@ -242,11 +243,21 @@ def refine_test_poses(
         return NOT_REFINED
     start = time.monotonic()
     with context.progress(len(frames), "refining test poses") as progress:
-        refined = refine(clip, follow, background, settings.refine_steps, progress.advance)
+        perceptual = refinement_lpips(context)
+        refined = refine(clip, follow, background, settings.refine_steps, progress.advance, perceptual)
     context.timing("refinement_seconds", time.monotonic() - start)
     write_refined(context.output / "test_poses.parquet", refined)
     context.log(refinement_cost(context, refined))
     return refined
+
+
+def refinement_lpips(context: Context) -> PictureLoss | None:
+    """The weighted LPIPS of the refinement; None where it has no weight."""
+    settings: EvaluateSettings = context.settings
+    if not settings.refine_lpips:
+        return None
+    network = Lpips(context.assets["lpips"], settings.refine_lpips_network)
+    return lambda image, truth: settings.refine_lpips * network(image, truth)[0]
 
 
 def refinement_cost(context: Context, refined: RefinedTestPoses) -> str:

@@ -31,6 +31,7 @@ from pipeline.config.settings import (
     NotEmpty,
     Positive,
     Seed,
+    Weight,
     setting,
 )  # fmt: skip
 
@@ -63,6 +64,8 @@ class EvaluateSettings:
         "auto: as the protocol says",
     )
     refine_steps: Rounds = setting(60, "steps of that refinement, a frame")
+    refine_lpips: Weight = setting(0.0, "weight of LPIPS in it, beside 0.8 L1 and 0.2 SSIM")
+    refine_lpips_network: LpipsNetwork = setting("vgg", "its backbone")
     lpips_networks: tuple[LpipsNetwork, ...] = setting(
         ("alex",), "backbones of LPIPS; on a CPU VGG costs twenty times what AlexNet does"
     )

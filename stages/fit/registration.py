@@ -20,7 +20,7 @@ from pipeline.numba_kernels import threads
 from pipeline.pose_files import InitialPoses
 from stages.fit.adam import Recorder, optimise
 from stages.fit.camera_batch import CameraBatch, stack
-from stages.fit.face import fit_face
+from stages.fit.face import FaceTarget, fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.initialise_from_poses import initial_facing, initial_from_files
@@ -42,7 +42,7 @@ class Registration:
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
         curve: loss and reprojection error over the steps.
         seconds: (step, seconds since the start) at the curve's points.
-        face_frames: in how many frames a face was fitted first; 0 where none was.
+        face_frames: in how many frames a face was fitted first, or an expression was given; 0 in none.
     """
 
     identity: Identity
@@ -78,6 +78,8 @@ def register(
     Raises:
         UserError: a frame has no camera, or there are no frames.
     """
+    directions = body.expression_directions[..., : settings.expressions]
+    body = dataclasses.replace(body, expression_directions=directions)
     views = views_of(keypoints, cameras)
     keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
     size = views.size.numpy()
@@ -108,8 +110,18 @@ def register(
     fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
     identity, poses = _outcome(objective, fitted, spread)
     error = objective.residuals(fitted)
-    seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
-    return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
+    registered = registered_faces(settings, target, start)
+    return Registration(
+        identity, poses, observations, error, recorder.curve, tuple(recorder.seconds), registered
+    )
+
+
+def registered_faces(settings: FitSettings, target: FaceTarget | None, start: InitialPoses | None) -> int:
+    """The number of frames whose face is registered: fitted first, or with the expression that was given."""
+    if target is not None:
+        return int(target.valid.sum())
+    given = start is not None and start.expression is not None and settings.face != "off"
+    return int(start.valid.sum()) if given and start is not None else 0
 
 
 def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:

@@ -66,7 +66,8 @@ def _run(context: Context) -> None:
     smoothed = smooth(fitted.poses, window)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
-    registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
+    source = "given" if context.settings.given == "keep" else context.settings.face
+    registered = {"source": source, "frames": len(smoothed), "registered": fitted.face_frames}
     write_json(context.output / "face.json", registered)  # what the plan says of face registration
     fitted.curve.write(context.output / "curve.parquet")
     write_template(context.output / "template.ply", body, fitted.identity)
@@ -94,7 +95,10 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
 
         source = read_footage(ingest / "footage.json").all_frames
         fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log, source)
-    return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
+    if kept is None:
+        return fitted
+    identity, poses = kept  # whose face is as registered as the rest of it
+    return dataclasses.replace(fitted, identity=identity, poses=poses, face_frames=int(poses.valid.sum()))
 
 
 def write_motion(
