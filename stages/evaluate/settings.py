@@ -44,7 +44,7 @@ class EvaluateSettings:
     """Settings of the evaluate stage; frames of which there are several are evenly spaced."""
 
     # Sets of the four choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
-    # poses refined), paper_black TalkShow's and ZJU-MoCap's (black, the truth's mask on both).
+    # poses refined), paper_black that of its other tables (black, the truth's mask on both).
     protocol: ProtocolName = setting(
         "ours", "a named set of choices, see pipeline/config/evaluation_protocol.py"
     )
