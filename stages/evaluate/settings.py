@@ -81,6 +81,9 @@ class EvaluateSettings:
     identity: bool = setting(
         False, "compare faces by dlib's embedding: needs the assets dlib and identity, 0.15 s a picture"
     )
+    arcface: str = setting(
+        "", "ArcFace's ONNX file (112 x 112 pixels to 512 numbers): faces are compared as the paper does"
+    )
     bootstrap_rounds: Rounds = setting(2000, "samples that are drawn for the intervals")
     bootstrap_seed: Seed = setting(0, "of those draws")
     confidence: Share = setting(0.95, "share of the drawn means that lie inside an interval")
