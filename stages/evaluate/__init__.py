@@ -42,6 +42,6 @@ STAGE = Stage(
     },
     assets=lambda settings: settings.assets,
     reads_body=True,
-    path_settings=("second_mask",),
-    path_words=("off", "edge", "estimator"),
+    path_settings=("second_mask", "arcface"),
+    path_words=("", "off", "edge", "estimator"),
 )

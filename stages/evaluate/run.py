@@ -22,6 +22,7 @@ from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
 from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
+from pipeline.metrics.arcface import ArcFace
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
@@ -33,7 +34,7 @@ from pipeline.store import artifact
 from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
-from stages.evaluate.frame_metrics import FaceEmbedder, Scorer
+from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer
 from stages.evaluate.methods import (
     AVATAR,
     REFINED,
@@ -111,6 +112,7 @@ def run(context: Context) -> None:
         embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
+        arcface=ArcFace(Path(settings.arcface)) if settings.arcface else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
         start=start,
@@ -154,6 +156,7 @@ def evaluate(
     mesh: TexturedMesh | None = None,
     second: SecondMask | None = None,
     embedder: FaceEmbedder | None = None,
+    arcface: AlignedFaceEmbedder | None = None,
     other_cameras: Sequence[TableRow] = (),
     surface: SeenSurface | None = None,
     start: float | None = None,
@@ -169,6 +172,7 @@ def evaluate(
         mesh: the textured mesh, where it is scored.
         second: the second masks, where the ceiling is measured.
         embedder: of faces, where they are compared.
+        arcface: the same as the paper does, where it is asked for.
         other_cameras: scores in cameras that are not the clip's.
         surface: of the Gaussians, if they are to be looked at from all sides.
         start: when the stage began, by ``time.monotonic``; now if None.
@@ -183,7 +187,9 @@ def evaluate(
     refined_avatar = AvatarMethod(REFINED, clip, animate, refined.poses.keys(), refined.poses)
     methods: list[Method] = [avatar, refined_avatar, mean, nearest, *([mesh] if mesh else []), second]
     comparisons = empty_comparisons(clip, settings)
-    table = score_table([*score(context, clip, methods, scorer, embedder, comparisons), *other_cameras])
+    table = score_table(
+        [*score(context, clip, methods, scorer, (embedder, arcface), comparisons), *other_cameras]
+    )
     write_scores(context.output / "metrics.parquet", table)
     relaxed = relaxed_gaussians(clip, animate, settings)
     write_ply(context.output / "avatar.ply", relaxed, context.settings.ply_up)
@@ -218,14 +224,14 @@ def score(
     clip: EvaluatedClip,
     methods: Sequence[Method],
     scorer: Scorer,
-    embedder: FaceEmbedder | None,
+    faces: tuple[FaceEmbedder | None, AlignedFaceEmbedder | None],
     comparisons: Comparisons,
 ) -> list[TableRow]:
     """The scores of the clip; ``comparisons`` gets the pictures that are shown."""
     frames = frames_to_score(clip, context.settings.training_frames)
     start, rows = time.monotonic(), []
     with context.progress(len(frames), "scoring") as progress:
-        for scored in score_clip(clip, methods, scorer, frames, embedder):
+        for scored in score_clip(clip, methods, scorer, frames, *faces):
             rows += scored.rows
             comparisons.add(scored)
             progress.advance()

@@ -45,7 +45,7 @@ class EvaluateSettings:
     """Settings of the evaluate stage; frames of which there are several are evenly spaced."""
 
     # Sets of the four choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
-    # poses refined), paper_black TalkShow's and ZJU-MoCap's (black, the truth's mask on both).
+    # poses refined), paper_black that of its other tables (black, the truth's mask on both).
     protocol: ProtocolName = setting(
         "ours", "a named set of choices, see pipeline/config/evaluation_protocol.py"
     )
@@ -83,6 +83,9 @@ class EvaluateSettings:
     second_mask_frames: CountOrNone = setting(12, "held-out frames that it is measured on; 0: all")
     identity: bool = setting(
         False, "compare faces by dlib's embedding: needs the assets dlib and identity, 0.15 s a picture"
+    )
+    arcface: str = setting(
+        "", "ArcFace's ONNX file (112 x 112 pixels to 512 numbers): faces are compared as the paper does"
     )
     bootstrap_rounds: Rounds = setting(2000, "samples that are drawn for the intervals")
     bootstrap_seed: Seed = setting(0, "of those draws")
