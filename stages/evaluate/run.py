@@ -29,11 +29,12 @@ from pipeline.pictures import side_by_side
 from pipeline.run.job import peak_memory, shown
 from pipeline.run.stage import Context
 from pipeline.run.versions import versions
-from pipeline.splat import Gaussians, write_ply
+from pipeline.splat import Gaussians
 from pipeline.store import artifact
 from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
+from stages.evaluate.exports import Rig, avatar_rig, write_exports
 from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer
 from stages.evaluate.methods import (
     AVATAR,
@@ -87,8 +88,8 @@ def run(context: Context) -> None:
     """Evaluates the trained avatar of one subject.
 
     Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
-    ``turntable.mp4``, ``motion.mp4`` and ``avatar.ply``, and ``test_poses.parquet`` where the test poses were
-    refined.
+    ``turntable.mp4``, ``motion.mp4``, the splats ``avatar.ply``, ``avatar.spz`` and ``avatar_splats.glb``,
+    the rigged mesh ``avatar.glb``, and ``test_poses.parquet`` where the test poses were refined.
 
     Raises:
         UserError: a file of an upstream stage or an asset is missing or damaged.
@@ -101,6 +102,7 @@ def run(context: Context) -> None:
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
     animate, mesh = baked_animation(avatar), make_mesh(context, clip)
+    rig = avatar_rig(avatar, clip.body, context.body_file, relaxed(clip, settings))
     evaluate(
         context,
         clip,
@@ -115,6 +117,7 @@ def run(context: Context) -> None:
         arcface=ArcFace(Path(settings.arcface)) if settings.arcface else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
+        rig=rig,
         start=start,
     )
 
@@ -159,6 +162,7 @@ def evaluate(
     arcface: AlignedFaceEmbedder | None = None,
     other_cameras: Sequence[TableRow] = (),
     surface: SeenSurface | None = None,
+    rig: Rig | None = None,
     start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
@@ -175,6 +179,7 @@ def evaluate(
         arcface: the same as the paper does, where it is asked for.
         other_cameras: scores in cameras that are not the clip's.
         surface: of the Gaussians, if they are to be looked at from all sides.
+        rig: the body with the avatar's colours, if it is to be published.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
@@ -191,12 +196,12 @@ def evaluate(
         [*score(context, clip, methods, scorer, (embedder, arcface), comparisons), *other_cameras]
     )
     write_scores(context.output / "metrics.parquet", table)
-    relaxed = relaxed_gaussians(clip, animate, settings)
-    write_ply(context.output / "avatar.ply", relaxed, context.settings.ply_up)
-    cover = write_pictures(context, avatar, relaxed, comparisons)
+    standing = relaxed_gaussians(clip, animate, settings)
+    files = write_exports(context, standing, rig)
+    cover = write_pictures(context, avatar, standing, comparisons)
     summary = summarise(context, clip, table, scorer, nearest.nearest, refined, gate, second)
-    summary["gaussians"] = len(relaxed)
-    turned = turn(context, relaxed, surface)
+    summary["gaussians"], summary["files"] = len(standing), dict(files)
+    turned = turn(context, standing, surface)
     summary["turned"] = None if turned is None else turned.numbers
     summary["verdict"] = verdict(summary, clip_coverage(context, plan, gate))
     write_json(context.output / "summary.json", summary)
@@ -279,9 +284,14 @@ def refinement_cost(context: Context, refined: RefinedTestPoses) -> str:
 
 @torch.no_grad()
 def relaxed_gaussians(clip: EvaluatedClip, animate: Animate, settings: EvaluateSettings) -> Gaussians:
-    """The canonical avatar in the turn's pose, facing +Z at the origin, without expression."""
+    """The avatar in the turn's pose."""
+    return animate(relaxed(clip, settings), None)
+
+
+def relaxed(clip: EvaluatedClip, settings: EvaluateSettings) -> Pose:
+    """The turn's pose, facing +Z at the origin, without expression."""
     expression = torch.zeros(clip.poses.expression.shape[1])
-    return animate(Pose(relaxed_pose(settings.arm_angle), expression, torch.zeros(3)), None)
+    return Pose(relaxed_pose(settings.arm_angle), expression, torch.zeros(3))
 
 
 def write_pictures(

@@ -37,6 +37,7 @@ from pipeline.config.settings import (
 
 Rounds = Annotated[int, Field(ge=1, le=1_000_000)]
 Share = Annotated[float, Field(gt=0, lt=1)]
+TextureSide = Annotated[int, Field(ge=16, le=8192)]
 Auto = Literal["auto"]
 
 
@@ -100,6 +101,7 @@ class EvaluateSettings:
     turntable_height: EvenSide = setting(640, "pixels of the turn")
     turntable_fps: FrameRate = setting(30.0, "frames a second of the turn, and of the motion")
     ply_up: PlyUp = setting("-y", "the axis that points up in avatar.ply; most viewers show -y upright")
+    glb_texture: TextureSide = setting(1024, "pixels of the side of avatar.glb's texture")
     arm_angle: Angle = setting(1.0, "how far the arms hang below the T pose in the turn, radians")
     motion_frames: FramesOrNone = setting(
         48, "frames of a motion that was never filmed (arms up, head turned); 0: without it"
