@@ -156,7 +156,9 @@ def _followed(baked: BakedAvatar, pose: Pose) -> Tensor:
     found = torch.zeros(len(baked), 9)
     rest = baked.rest_shape(pose)
     if len(constants.correctives):
-        plain = dataclasses.replace(baked, constants=dataclasses.replace(constants, correctives=torch.zeros(0)))
+        plain = dataclasses.replace(
+            baked, constants=dataclasses.replace(constants, correctives=torch.zeros(0))
+        )
         found[:, 3:6] += rest - plain.rest_shape(pose)
     transforms = joint_transforms(pose.rotation[None], constants.joints, baked.parents)[0]
     condition = Condition(pose_features(pose.rotation), pose.expression, None)

@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=6,
+    version=7,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={

@@ -86,7 +86,7 @@ const Viewer = (() => {
       const box = this.root.querySelector(".knobs"), avatar = this.avatar, groups = {};
       const motions = element("select", { title: "what it does" }, element("option", { textContent: "stand still", value: "-1" }));
       avatar.motions.forEach((one, k) => motions.append(element("option", { textContent: one.name, value: String(k) })));
-      motions.value = "0";
+      this.motions = motions;
       motions.addEventListener("change", () => this.choose(Number(motions.value)));
       this.button = element("button", { type: "button", textContent: "play", className: "play" });
       this.button.addEventListener("click", () => this.play(!this.playing));
@@ -140,6 +140,7 @@ const Viewer = (() => {
     choose(motion) {
       const one = this.avatar.motions[motion];
       this.motion = one ? motion : -1;
+      this.motions.value = String(this.motion);
       this.frame = 0;
       this.time.max = one ? one.frames - 1 : 0;
       this.time.value = 0;
@@ -194,19 +195,28 @@ const Viewer = (() => {
       return [R[0], R[1], R[2], -R[3], -R[4], -R[5], -R[6], -R[7], -R[8]];
     }
 
-    // Aims the orbit at the Gaussians as they are now.
+    // Aims the orbit at the Gaussians as they are in some frames of the motion, the first among them.
     aim() {
-      this.repose();
-      const basis = this.basis(), data = this.data, lists = [[], [], []];
-      const step = Math.max(1, this.avatar.count / 4000 | 0);
-      for (let i = 0; i < this.avatar.count; i += step) {
-        const p = Posing.times(basis, data[12 * i], data[12 * i + 1], data[12 * i + 2]);
-        for (let c = 0; c < 3; c++) lists[c].push(p[c]);
+      const one = this.avatar.motions[this.motion], frames = one ? [0.75, 0.5, 0.25, 0].map(part => part * one.frames | 0) : [0];
+      const lists = [[], [], []];
+      for (const frame of new Set(frames)) {
+        this.frame = frame;
+        this.gather(lists);
       }
-      const ends = lists.map(one => { one.sort((a, b) => a - b); return [one[one.length * 0.005 | 0], one[one.length * 0.995 | 0]]; });
+      const ends = lists.map(one => { one.sort((a, b) => a - b); return [one[one.length * 0.002 | 0], one[one.length * 0.998 | 0]]; });
       this.centre = ends.map(([low, high]) => (low + high) / 2);
       this.reach = ends.map(([low, high]) => Math.max((high - low) / 2, 0.05));
       this.change();
+    }
+
+    // Adds the places of the Gaussians, in the frame with Y up, to three lists.
+    gather(lists) {
+      this.repose();
+      const basis = this.basis(), data = this.data, step = Math.max(1, this.avatar.count / 4000 | 0);
+      for (let i = 0; i < this.avatar.count; i += step) {
+        const place = Posing.times(basis, data[12 * i], data[12 * i + 1], data[12 * i + 2]);
+        for (let c = 0; c < 3; c++) lists[c].push(place[c]);
+      }
     }
 
     // The camera of the orbit, or the one that filmed, for a canvas of so many pixels.
@@ -374,10 +384,11 @@ const Viewer = (() => {
     }
   }
 
-  function without(root, words) {
-    root.classList.add("without");
-    root.querySelector(".said").textContent = words;
+  // The page without the avatar: a line, and the film of its turn where the page has one.
+  function without(root, reason) {
     const film = root.querySelector(".film");
+    root.classList.add("without");
+    root.querySelector(".said").textContent = `${reason}: ${film ? "here is the film of its turn instead" : "its turn is filmed in turntable.mp4"}.`;
     if (film) film.hidden = false;
   }
 
@@ -387,7 +398,7 @@ const Viewer = (() => {
       view = new View(root);
       if (typeof DecompressionStream === "undefined") throw new Error("it is too old");
     } catch (error) {
-      without(root, `This browser cannot draw the avatar (${error.message}): here is the film of its turn instead.`);
+      without(root, `This browser cannot draw the avatar (${error.message})`);
       return null;
     }
     const data = root.querySelector("script[type='text/plain']");
@@ -395,7 +406,7 @@ const Viewer = (() => {
     try {
       view.take(await Posing.unpack(embedded(data.textContent)));
     } catch (error) {
-      without(root, `The avatar in this page cannot be read (${error.message}): here is the film of its turn instead.`);
+      without(root, `The avatar in this page cannot be read (${error.message})`);
     }
     return view;
   }
