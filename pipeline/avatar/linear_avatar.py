@@ -134,7 +134,7 @@ def _own_bases(baked: BakedAvatar, own: BakedBases) -> tuple[DrivingSignal, Tens
 def _fitted_bases(
     baked: BakedAvatar, poses: Sequence[Pose], expressions: int
 ) -> tuple[DrivingSignal, Tensor, Tensor]:
-    """The signal of some poses, the mean [N, 9] and the bases [N, 6, B] that come nearest to what follows them."""
+    """The signal of some poses, and mean [N, 9] and bases [N, 6, B] nearest to what follows them."""
     shown = [poses[place] for place in spread_end_to_end(range(len(poses)), POSES)] if len(poses) else []
     shown = shown or [Pose(torch.zeros(55, 3), torch.zeros(expressions), torch.zeros(3))]
     features = torch.stack(
@@ -156,10 +156,8 @@ def _followed(baked: BakedAvatar, pose: Pose) -> Tensor:
     found = torch.zeros(len(baked), 9)
     rest = baked.rest_shape(pose)
     if len(constants.correctives):
-        plain = dataclasses.replace(
-            baked, constants=dataclasses.replace(constants, correctives=torch.zeros(0))
-        )
-        found[:, 3:6] += rest - plain.rest_shape(pose)
+        without = dataclasses.replace(constants, correctives=torch.zeros(0))
+        found[:, 3:6] += rest - dataclasses.replace(baked, constants=without).rest_shape(pose)
     transforms = joint_transforms(pose.rotation[None], constants.joints, baked.parents)[0]
     condition = Condition(pose_features(pose.rotation), pose.expression, None)
     share = constants.pose_share

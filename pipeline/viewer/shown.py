@@ -1,4 +1,4 @@
-"""What a page shows of a subject: its avatar, the motions it can play and the expressions that have sliders."""
+"""The content of a page: an avatar, the motions that it can play, and the expressions that have sliders."""
 
 from __future__ import annotations
 

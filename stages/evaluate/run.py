@@ -185,7 +185,7 @@ def evaluate(
         embedder: of faces, where they are compared.
         other_cameras: scores in cameras that are not the clip's.
         surface: of the Gaussians, if they are to be looked at from all sides.
-        packed: the avatar for the interactive page, as ``pipeline.viewer.packed`` writes it; None without one.
+        packed: the avatar for the interactive page, see ``pipeline.viewer.packed``; None without one.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings

@@ -101,7 +101,7 @@ class EvaluateSettings:
 
     interactive: bool = setting(
         True,
-        "the avatar itself in report.html and avatar.html, to be turned and posed; adds 1 to 4 MB to each",
+        "the avatar itself in report.html and avatar.html, to be turned and posed: 1 to 4 MB each",
     )
 
     @property
