@@ -10,7 +10,7 @@
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
     doit run animate subject=oliver motion=dance.bvh    the avatar in a motion that nobody filmed
-    doit run view subject=smile                 the avatar in a browser, to be turned and moved; also while it trains
+    doit run view subject=smile                 the avatar in a browser, also while it trains
     doit run ablate subject=smile               what each part of the method is worth
     doit run tradeoff subject=smile budget=20m  what accuracy costs in time
 

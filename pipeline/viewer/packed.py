@@ -27,7 +27,7 @@ from pipeline.clip.camera import Camera
 FORMAT = 1
 MOVE_STEP = 2e-5  # metres: with 16 bases of unit variance, rounding moves a point by 0.02 mm
 COLOR_STEP = 0.01  # logits, of which one of 255 levels is at least 0.016
-EXPRESSION_STEP = 2e-5  # metres a unit of expression
+EXPRESSION_STEP = 5e-6  # metres a unit of expression, of which many add up to twenty and more
 MIDDLE = 0x8080  # stands for zero: small numbers of both signs then share their high byte
 COMPRESSION = 6
 

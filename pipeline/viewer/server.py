@@ -20,12 +20,8 @@ from pipeline.viewer.page import viewer_page
 from pipeline.viewer.source import AvatarSource, said_of
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
-HTML, PICTURE, PACKED, JSON = (
-    "text/html; charset=utf-8",
-    "image/png",
-    "application/octet-stream",
-    "application/json",
-)
+HTML, JSON = "text/html; charset=utf-8", "application/json"
+PICTURE, PACKED = "image/png", "application/octet-stream"
 
 
 class LiveAvatar:

@@ -41,8 +41,9 @@ _SHEET_COLUMNS, _SHEET_SIDE = 4, 320  # of frames.png; pixels of a picture's lon
 def run(context: Context) -> None:
     """Animates one subject.
 
-    Publishes ``frames.png``, ``cameras.parquet``, ``motion.parquet`` (the poses) and ``animate.json``, and what is asked for of
-    ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and ``ply/<frame>.ply``, frames numbered from 0.
+    Publishes ``frames.png``, ``cameras.parquet``, ``motion.parquet`` (the poses) and ``animate.json``, and
+    what is asked for of ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and ``ply/<frame>.ply``,
+    frames numbered from 0.
 
     Raises:
         UserError: the motion cannot be read, or a file of an upstream stage is missing or damaged.
