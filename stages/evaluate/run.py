@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from pipeline.avatar import load_avatar
+from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Pose
 from pipeline.clip.curves import read_curve
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
@@ -31,6 +31,8 @@ from pipeline.run.stage import Context
 from pipeline.run.versions import versions
 from pipeline.splat import Gaussians
 from pipeline.store import artifact
+from pipeline.viewer.page import viewer_page
+from pipeline.viewer.shown import NOVEL_FRAMES, filmed_motion, novel_motion, packed_avatar
 from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
@@ -47,7 +49,7 @@ from stages.evaluate.methods import (
 )
 from stages.evaluate.other_cameras import camera_folders, read_true_surface, score_other_cameras
 from stages.evaluate.report.omissions import omissions
-from stages.evaluate.report.page import ReportContents, write_report
+from stages.evaluate.report.page import ReportContents, video_uri, write_report
 from stages.evaluate.report.pictures import (
     GAP,
     Comparisons,
@@ -89,7 +91,8 @@ def run(context: Context) -> None:
 
     Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
     ``turntable.mp4``, ``motion.mp4``, the splats ``avatar.ply``, ``avatar.spz`` and ``avatar_splats.glb``,
-    the rigged mesh ``avatar.glb``, and ``test_poses.parquet`` where the test poses were refined.
+    the rigged mesh ``avatar.glb``; ``avatar.html`` where it was asked for, and ``test_poses.parquet`` where
+    the test poses were refined.
 
     Raises:
         UserError: a file of an upstream stage or an asset is missing or damaged.
@@ -118,8 +121,20 @@ def run(context: Context) -> None:
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
         rig=rig,
+        packed=pack_avatar(context, clip, avatar) if settings.interactive else None,
         start=start,
     )
+
+
+def pack_avatar(context: Context, clip: EvaluatedClip, avatar: Avatar) -> bytes:
+    """The avatar for the interactive page, with the motion that was never filmed and the clip's own."""
+    settings: EvaluateSettings = context.settings
+    start, poses = time.monotonic(), clip.shown_poses()
+    novel = novel_motion(settings.arm_angle, settings.motion_frames or NOVEL_FRAMES, settings.turntable_fps)
+    motions = [novel, filmed_motion(poses, clip.cameras, clip.frames_a_second())]
+    packed = packed_avatar(avatar, poses, motions, context.body_file, settings.arm_angle)
+    context.timing("page_seconds", time.monotonic() - start)
+    return packed
 
 
 def make_mesh(context: Context, clip: EvaluatedClip) -> TexturedMesh | None:
@@ -163,6 +178,7 @@ def evaluate(
     other_cameras: Sequence[TableRow] = (),
     surface: SeenSurface | None = None,
     rig: Rig | None = None,
+    packed: bytes | None = None,
     start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
@@ -180,6 +196,7 @@ def evaluate(
         other_cameras: scores in cameras that are not the clip's.
         surface: of the Gaussians, if they are to be looked at from all sides.
         rig: the body with the avatar's colours, if it is to be published.
+        packed: the avatar for the interactive page, see ``pipeline.viewer.packed``; None without one.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
@@ -208,7 +225,11 @@ def evaluate(
     contents = report_contents(
         context, clip, summary, table, comparisons, cover, (plan, refined, gate), time.monotonic() - start
     )
-    contents = dataclasses.replace(contents, turned=turned)
+    contents = dataclasses.replace(contents, turned=turned, packed=packed)
+    if packed is not None:
+        film = video_uri(context.output / "turntable.mp4")
+        page = viewer_page(context.subject, packed, film)
+        (context.output / "avatar.html").write_text(page, encoding="utf-8")
     write_report(context.output / "report.html", contents)
     show_summary(summary, shown(report_place(context.output)))
 

@@ -107,6 +107,11 @@ class EvaluateSettings:
         48, "frames of a motion that was never filmed (arms up, head turned); 0: without it"
     )
 
+    interactive: bool = setting(
+        True,
+        "the avatar itself in report.html and avatar.html, to be turned and posed: 1 to 4 MB each",
+    )
+
     @property
     def choices(self) -> Protocol:
         """What the protocol and the settings say together."""
