@@ -37,6 +37,9 @@ CAMERA_SCHEMA = pa.schema(
         ("translation", vectors(3, pa.float64())),
     ]
 )
+SHOT_STEP = 100_000
+"""Frame numbers of a rig's n-th further camera begin at n times this."""
+
 _REMEDY = "run the ingest stage again"
 
 

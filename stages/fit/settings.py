@@ -52,6 +52,10 @@ class FitSettings:
     )
 
     # What is published
+    accept: Literal["good", "any"] = setting(
+        "good",
+        "good: leave out frames whose body is not on the person, and refuse a clip of such; any: go on",
+    )
     smoothing_window: Window = setting(
         5, "frames of the Savitzky-Golay filter, odd, from 3; 0 leaves the poses as fitted"
     )
