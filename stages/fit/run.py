@@ -23,6 +23,7 @@ from pipeline.body import (
     write_poses,
 )
 from pipeline.clip.camera import Camera
+from pipeline.clip.clock import frame_times
 from pipeline.clip.fit_quality import write_fit_quality
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.keypoints import read_keypoints
@@ -37,7 +38,7 @@ from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
-from stages.fit.smoothing import smooth
+from stages.fit.smoothing import smooth, window_of
 
 RESIDUALS_SCHEMA = pa.schema(
     [("frame", pa.int32()), ("group", pa.string()), ("point", pa.int32()), ("pixels", pa.float32())]
@@ -60,8 +61,9 @@ def _run(context: Context) -> None:
     context.timing("registration_seconds", round(time.monotonic() - start, 2))
     context.timing("registration_cpu_seconds", round(time.process_time() - cpu, 2))
     context.timing("curve_seconds", [[step, round(at, 3)] for step, at in fitted.seconds])
-    window = 0 if context.settings.given == "keep" else context.settings.smoothing_window
-    smoothed = smooth(fitted.poses, window)
+    times = frame_times(fitted.poses.frames, read_footage(ingest / "footage.json"))
+    seconds = 0.0 if context.settings.given == "keep" else context.settings.smoothing_seconds
+    smoothed = smooth(fitted.poses, window_of(seconds, times), times=times)
     judge_fit(context, body, fitted, smoothed, cameras)
     means = group_means(fitted.error, fitted.observations)
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
@@ -95,8 +97,20 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         def report(note: str) -> None:
             progress.advance(1, note)
 
-        source = read_footage(ingest / "footage.json").all_frames
-        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log, source)
+        footage = read_footage(ingest / "footage.json")
+        times = frame_times(keypoints.frames, footage)
+        fitted = register(
+            body,
+            landmarks,
+            keypoints,
+            cameras,
+            settings,
+            report,
+            initial,
+            context.log,
+            footage.all_frames,
+            times,
+        )
     return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
 
 

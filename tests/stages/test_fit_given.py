@@ -84,8 +84,8 @@ def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, 
 
 def test_the_fit_starts_from_them(tmp_path, shown, ingested):
     """Without steps the start is published: it is the files', and not the estimator's."""
-    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_window=0)
-    only_start = {"iterations": 0, "smoothing_window": 0, "accept": "any"}
+    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_seconds=0.0)
+    only_start = {"iterations": 0, "smoothing_seconds": 0.0, "accept": "any"}
     ignored = fit(tmp_path / "ignore", ingested, given="ignore", **only_start)
     wanted = shown.poses.rotation
     for output, near in ((started, True), (ignored, False)):
