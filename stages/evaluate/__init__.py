@@ -25,6 +25,7 @@ STAGE = Stage(
         "fit": (
             "identity.safetensors",
             "poses.parquet",
+            "fit_quality.parquet",
             "curve.parquet",
             "residuals.parquet",
             "overlay.mp4",

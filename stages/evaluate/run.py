@@ -220,7 +220,7 @@ def evaluate(
     summary["gaussians"], summary["files"] = len(standing), dict(files)
     turned = turn(context, standing, surface)
     summary["turned"] = None if turned is None else turned.numbers
-    summary["verdict"] = verdict(summary, clip_coverage(context, plan, gate))
+    summary["verdict"] = verdict(summary, clip_coverage(context, clip, plan, gate))
     write_json(context.output / "summary.json", summary)
     contents = report_contents(
         context, clip, summary, table, comparisons, cover, (plan, refined, gate), time.monotonic() - start
@@ -357,10 +357,10 @@ def write_motion(context: Context, avatar: AvatarMethod) -> None:
     context.timing("motion_seconds", time.monotonic() - start)
 
 
-def clip_coverage(context: Context, plan: Plan, gate: GateRecord) -> ClipCoverage:
-    """The parts of the person that the clip shows."""
+def clip_coverage(context: Context, clip: EvaluatedClip, plan: Plan, gate: GateRecord) -> ClipCoverage:
+    """The parts of the person that the clip shows, and how well the body fits it."""
     unmodelled, azimuths = 1 - gate.kept / gate.vertices, plan["auxiliary_views"].values
-    return ClipCoverage(unmodelled, azimuths, fit_error(context.inputs["fit"]))
+    return ClipCoverage(unmodelled, azimuths, fit_error(context.inputs["fit"]), clip.quality)
 
 
 def report_contents(

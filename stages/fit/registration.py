@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Landmarks, Poses
 from pipeline.clip.camera import Camera
+from pipeline.clip.clock import times_of_numbers
 from pipeline.clip.curves import Curve
 from pipeline.clip.frame_files import ClipFrames
 from pipeline.clip.keypoints import Keypoints
@@ -65,6 +66,7 @@ def register(
     start: InitialPoses | None = None,
     log: Callable[[str], None] = lambda note: None,
     source: ClipFrames | None = None,
+    times: np.ndarray | None = None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -74,6 +76,7 @@ def register(
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.
         source: all frames of the footage, which names of given files mean.
+        times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
@@ -81,10 +84,13 @@ def register(
     directions = body.expression_directions[..., : settings.expressions]
     body = dataclasses.replace(body, expression_directions=directions)
     views = views_of(keypoints, cameras)
-    keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
+    times = times_of_numbers(keypoints.frames) if times is None else times
+    keypoints = _without_outlier_frames(keypoints, times, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
-    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
+    observations = observe(
+        keypoints, landmarks, settings.score_threshold, size, settings.masked, facing, times
+    )
     target = fit_face(body, landmarks, keypoints, observations, views, settings, log, source)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
@@ -102,7 +108,9 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
-    objective = RegistrationObjective(body, observations, model, views, initial, movable, settings, face)
+    objective = RegistrationObjective(
+        body, observations, model, views, initial, movable, settings, face, torch.from_numpy(times)
+    )
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
@@ -124,9 +132,9 @@ def registered_faces(settings: FitSettings, target: FaceTarget | None, start: In
     return int(start.valid.sum()) if given and start is not None else 0
 
 
-def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+def _without_outlier_frames(keypoints: Keypoints, times: np.ndarray, log: Callable[[str], None]) -> Keypoints:
     """The detections with outlier frames masked, see ``outlier_frames.py``; the log names these frames."""
-    keypoints, outliers = mask_outlier_frames(keypoints)
+    keypoints, outliers = mask_outlier_frames(keypoints, times)
     if outliers:
         log(
             f"frame {', '.join(map(str, outliers))}: left and right are exchanged, or the points are nowhere "

@@ -13,7 +13,7 @@ Steps = Annotated[int, Field(ge=0, le=1_000_000)]
 Coefficients = Annotated[int, Field(ge=1, le=1000)]
 Factor = Annotated[float, Field(gt=0, le=1000)]
 FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
-Window = Annotated[int, Field(ge=0, le=1001)]
+Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 @dataclass(frozen=True, config=SETTINGS)
@@ -53,8 +53,13 @@ class FitSettings:
     )
 
     # What is published
-    smoothing_window: Window = setting(
-        5, "frames of the Savitzky-Golay filter, odd, from 3; 0 leaves the poses as fitted"
+    accept: Literal["good", "any"] = setting(
+        "good",
+        "good: leave out frames whose body is not on the person, and refuse a clip of such; any: go on",
+    )
+    smoothing_seconds: Seconds = setting(
+        0.18,
+        "length of the Savitzky-Golay filter: 5 frames of 25 or 30 a second; 0 leaves the poses as fitted",
     )
     export_peers: bool = setting(
         False, "write identity and poses in ExAvatar's and FlexiAvatar's JSON layout too"
@@ -63,9 +68,6 @@ class FitSettings:
 
     @model_validator(mode="after")
     def _fit_together(self) -> FitSettings:
-        window = self.smoothing_window
-        if window and (window < 3 or window % 2 == 0):
-            raise ValueError(f"fit.smoothing_window must be 0 or odd, from 3, not {window}")
         if self.face == "flame" and not (self.face_init and self.flame_model):
             raise ValueError("fit.face=flame needs fit.face_init and fit.flame_model")
         if self.face != "flame" and (self.face_init or self.flame_model):

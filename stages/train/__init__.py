@@ -10,7 +10,7 @@ STAGE = Stage(
     run="stages.train.run:run",
     needs={
         "ingest": ("frames/*", "masks/*", "foreground/*", "cameras.parquet", "split.json", "footage.json"),
-        "fit": ("identity.safetensors", "poses.parquet"),
+        "fit": ("identity.safetensors", "poses.parquet", "fit_quality.parquet"),
         "plan": ("plan.json",),
         "auxiliary": (
             "frames/*",
