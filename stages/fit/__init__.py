@@ -21,7 +21,7 @@ def idle(settings: FitSettings) -> dict[str, str]:
 
 STAGE = Stage(
     name="fit",
-    version=8,
+    version=9,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={

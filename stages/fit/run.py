@@ -35,6 +35,7 @@ from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
+from stages.fit.settings import FitSettings
 from stages.fit.smoothing import smooth
 
 RESIDUALS_SCHEMA = pa.schema(
@@ -62,8 +63,7 @@ def _run(context: Context) -> None:
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
     context.log(f"reprojection: {summary or 'no keypoint was trusted in any frame'}")
     write_identity(context.output / "identity.safetensors", fitted.identity, body)
-    window = 0 if context.settings.given == "keep" else context.settings.smoothing_window
-    smoothed = smooth(fitted.poses, window)
+    smoothed = published_poses(fitted, context.settings)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
     registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
@@ -73,6 +73,17 @@ def _run(context: Context) -> None:
     start = time.monotonic()
     write_overlays(context, body, fitted.identity, smoothed, cameras)
     context.timing("overlay_seconds", round(time.monotonic() - start, 2))
+
+
+def published_poses(fitted: Registration, settings: FitSettings) -> Poses:
+    """The poses that are published: smoothed, but for eyes, steadied on their own, and for kept poses."""
+    if settings.given == "keep":
+        return fitted.poses
+    smoothed = smooth(fitted.poses, settings.smoothing_window)
+    if fitted.eyes is None:
+        return smoothed
+    expression, rotation = fitted.eyes.applied(smoothed.expression, smoothed.rotation)
+    return dataclasses.replace(smoothed, expression=expression, rotation=rotation)
 
 
 def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -> Registration:
