@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
+from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints, write_poses
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over, to_bytes
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
@@ -44,9 +44,9 @@ _SHEET_COLUMNS, _SHEET_SIDE = 4, 320  # of frames.png; pixels of a picture's lon
 def run(context: Context) -> None:
     """Animates one subject.
 
-    Publishes ``frames.png``, ``cameras.parquet`` and ``animate.json``, and what is asked for of
-    ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and splats, ``ply/<frame>.ply``, ``spz/`` and
-    ``glb/``, frames numbered from 0.
+    Publishes ``frames.png``, ``cameras.parquet``, ``motion.parquet`` (the poses) and ``animate.json``, and
+    what is asked for of ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and splats,
+    ``ply/<frame>.ply``, ``spz/`` and ``glb/``, frames numbered from 0.
 
     Raises:
         UserError: the motion cannot be read, or a file of an upstream stage is missing or damaged.
@@ -66,6 +66,7 @@ def run(context: Context) -> None:
     cameras = frame_cameras(context, animation, actor, body)
     draw_animation(context, animation, actor, cameras)
     write_cameras(context.output / "cameras.parquet", dict(enumerate(cameras)))
+    write_poses(context.output / "motion.parquet", animation.poses)
     write_json(context.output / "animate.json", summary(settings, animation, actor, legs, idle))
     log_result(context, animation, len(actor))
 
