@@ -80,21 +80,6 @@ def test_a_clip_that_is_named_is_made_a_subject_of_its_own(toy):
     assert not (toy.store / "dance" / "paint").exists()
 
 
-def test_where_a_clip_lies_is_not_part_of_what_is_known_of_it(toy):
-    names = []
-    for folder in ("here", "there"):
-        clip = toy.root / folder / "dance.txt"
-        clip.parent.mkdir()
-        clip.write_text("jig ")
-        toy.doit("bend:dance", "subject=dance", f"source={clip}")
-        toy.doit("bend:ann", "subject=ann")
-        (loan, _) = open_job("ann", toy.request()).stages["sing"].demands(
-            type(open_job("ann", toy.request()).settings["sing"])(tune=f"clip:{clip}")
-        ).loans
-        names.append(loan.described())
-    assert names[0] == names[1]
-
-
 def test_a_clip_with_a_subjects_name_and_other_footage_is_refused(toy):
     for name, known in (("bob", "there is a subject 'bob'"), ("dance", "the store's 'dance'")):
         clip = toy.root / "first" / f"{name}.txt"
