@@ -104,7 +104,7 @@ class BakedAvatar:
         linear = self.representation.linear_change(condition)
         if linear is not None and not len(constants.correctives) and constants.pose_share is None:
             return self._pose_at_once(linear, transforms, pose)
-        points = rest = self._rest_shape(pose)
+        points = rest = self.rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         change = self.representation.change(condition, lambda: self.skinning_tables.normals(transforms, rest))
         share = constants.pose_share
@@ -153,7 +153,7 @@ class BakedAvatar:
             (*LOG_SCALE_RANGE, LARGEST_SCALE),
         )
 
-    def _rest_shape(self, pose: Pose) -> Tensor:
+    def rest_shape(self, pose: Pose) -> Tensor:
         """The points before skinning, a copy: [N, 3]."""
         constants = self.constants
         moved = constants.expressions[..., : len(pose.expression)] @ pose.expression

@@ -19,6 +19,8 @@ from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError, first_line
 
 FORMAT = "flexiavatar-avatar-4"
+PREVIEW = "preview.safetensors"
+"""The file beside a checkpoint that holds the avatar as it is so far."""
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
@@ -60,6 +62,13 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     # One entry only: safetensors writes several in an order of its own, different in each process.
     metadata = {"avatar": json.dumps(header, sort_keys=True)}
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
+
+
+def save_preview(folder: Path, avatar: Avatar) -> None:
+    """Replaces the avatar that a run shows of itself while it trains, in one step."""
+    partial = folder / f"{PREVIEW}.partial"
+    save_avatar(partial, avatar)
+    partial.replace(folder / PREVIEW)
 
 
 def _stored_name(name: str) -> str:

@@ -224,8 +224,8 @@ def test_stage_publishes_its_files_twice_alike(tmp_path, model, ingest):
         run(context)
     files = sorted(path.name for path in contexts[0].output.iterdir())
     assert files == [
-        "curve.parquet", "face.json", "identity.safetensors", "overlay.mp4", "overlay.png", "poses.parquet",
-        "poses_raw.parquet", "residuals.parquet", "template.ply",
+        "curve.parquet", "face.json", "fit_quality.parquet", "identity.safetensors", "overlay.mp4",
+        "overlay.png", "poses.parquet", "poses_raw.parquet", "residuals.parquet", "template.ply",
     ]  # fmt: skip
     for name in files:
         first, second = ((context.output / name).read_bytes() for context in contexts)

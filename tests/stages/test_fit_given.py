@@ -76,6 +76,7 @@ def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, 
     assert surface_error(shown, output) < 1e-4
     names = {path.name for path in output.iterdir()}
     assert {
+        "fit_quality.parquet",
         "identity.safetensors",
         "poses.parquet",
         "template.ply",
@@ -88,8 +89,9 @@ def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, 
 
 def test_the_fit_starts_from_them(tmp_path, shown, ingested):
     """Without steps the start is published: it is the files', and not the estimator's."""
-    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_window=0)
-    ignored = fit(tmp_path / "ignore", ingested, given="ignore", iterations=0, smoothing_window=0)
+    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_seconds=0.0)
+    only_start = {"iterations": 0, "smoothing_seconds": 0.0, "accept": "any"}
+    ignored = fit(tmp_path / "ignore", ingested, given="ignore", **only_start)
     wanted = shown.poses.rotation
     for output, near in ((started, True), (ignored, False)):
         found = read_poses(output / "poses.parquet").rotation
