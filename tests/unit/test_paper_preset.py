@@ -1,10 +1,11 @@
-"""The paper preset: its weights against ExAvatar's."""
+"""The paper preset: its weights against ExAvatar's, and all of its settings against docs/paper.md."""
 
 import pytest
 
 from pipeline.config.settings import read_toml
 from pipeline.config.workspace import REPOSITORY
 from stages.train.settings import TrainSettings
+from tools.paper_settings import PAGE, ROW, resolved, written
 
 # ExAvatar's weights: of one branch's pictures, and of regularisers with the number of branches they take.
 OVER_SCENE, WITH_FACE, OVER_COLOR = {"l1": 0.8, "ssim": 0.2, "lpips": 0.2}, {"l1": 0.8}, {"l1": 1.0}
@@ -19,6 +20,17 @@ REGULARISERS = {  # name: (body, hands, face, scalp) in ExAvatar's units, rows t
     "pose_scale": ((1, 1000, 10, 1), 1, 1),
     "pose_offset": ((10, 10, 10, 10), 1, 1),  # 0 on hands and face
 }
+
+
+def test_docs_paper_lists_every_setting_of_the_preset_with_a_reason_where_it_differs():
+    """If this fails: python -m tools.paper_settings, and fill in the reasons."""
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == written(page)
+    quick, paper = resolved("quick"), resolved("paper")
+    reasons = dict(ROW.findall(page))
+    assert {name for name, reason in reasons.items() if reason.strip()} == {
+        name for name in paper if paper[name] != quick[name]
+    }
 
 
 @pytest.fixture(scope="module")
