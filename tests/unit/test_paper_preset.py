@@ -42,6 +42,8 @@ def test_pictures_count_as_often_as_exavatar_compares_them(train):
     pictures = (OVER_SCENE, WITH_FACE, OVER_COLOR)
     total = {name: BRANCHES * sum(one.get(name, 0) for one in pictures) for name in OVER_SCENE}
     assert train.l1 * train.l1_renderings == pytest.approx(total["l1"])
+    over_scene = BRANCHES * (OVER_SCENE["l1"] + WITH_FACE["l1"])
+    assert train.scene_share == pytest.approx(over_scene / total["l1"], abs=1e-3)
     assert train.ssim * train.renderings == pytest.approx(total["ssim"])
     assert train.lpips * train.renderings == pytest.approx(total["lpips"])
     assert train.face * train.renderings == pytest.approx(BRANCHES * FACE)
