@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=6,
+    version=7,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
@@ -25,6 +25,7 @@ STAGE = Stage(
         "fit": (
             "identity.safetensors",
             "poses.parquet",
+            "fit_quality.parquet",
             "curve.parquet",
             "residuals.parquet",
             "overlay.mp4",

@@ -31,11 +31,13 @@ from pipeline.config.settings import (
     NotEmpty,
     Positive,
     Seed,
+    Weight,
     setting,
 )  # fmt: skip
 
 Rounds = Annotated[int, Field(ge=1, le=1_000_000)]
 Share = Annotated[float, Field(gt=0, lt=1)]
+TextureSide = Annotated[int, Field(ge=16, le=8192)]
 Auto = Literal["auto"]
 
 
@@ -63,6 +65,8 @@ class EvaluateSettings:
         "auto: as the protocol says",
     )
     refine_steps: Rounds = setting(60, "steps of that refinement, a frame")
+    refine_lpips: Weight = setting(0.0, "weight of LPIPS in it, beside 0.8 L1 and 0.2 SSIM")
+    refine_lpips_network: LpipsNetwork = setting("vgg", "its backbone")
     lpips_networks: tuple[LpipsNetwork, ...] = setting(
         ("alex",), "backbones of LPIPS; on a CPU VGG costs twenty times what AlexNet does"
     )
@@ -97,9 +101,15 @@ class EvaluateSettings:
     turntable_height: EvenSide = setting(640, "pixels of the turn")
     turntable_fps: FrameRate = setting(30.0, "frames a second of the turn, and of the motion")
     ply_up: PlyUp = setting("-y", "the axis that points up in avatar.ply; most viewers show -y upright")
+    glb_texture: TextureSide = setting(1024, "pixels of the side of avatar.glb's texture")
     arm_angle: Angle = setting(1.0, "how far the arms hang below the T pose in the turn, radians")
     motion_frames: FramesOrNone = setting(
         48, "frames of a motion that was never filmed (arms up, head turned); 0: without it"
+    )
+
+    interactive: bool = setting(
+        True,
+        "the avatar itself in report.html and avatar.html, to be turned and posed: 1 to 4 MB each",
     )
 
     @property

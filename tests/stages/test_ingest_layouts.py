@@ -18,13 +18,12 @@ from scipy.spatial.transform import Rotation
 from pipeline.clip.camera import Camera, project
 from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import read_keypoints
-from pipeline.clip.records import read_cameras, read_footage, read_split
+from pipeline.clip.records import SHOT_STEP, read_cameras, read_footage, read_split
 from pipeline.errors import UserError
 from pipeline.pose_files import INITIAL_POSES, read_initial_poses, with_flat_hands
 from stages.fit.camera_batch import stack
 from stages.fit.initialise_from_poses import keep_given
 from stages.ingest.datasets.neuman import official_split
-from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
 from tests.made import layouts as writers
 from tests.made.body import BODY_FILE

@@ -25,7 +25,7 @@ from stages.fit.settings import FitSettings
 
 __all__ = ["FaceTarget", "fit_face", "sface"]
 
-_MESH_POINTS = 478
+_MESH_POINTS, _FACE_POINTS = 478, 68
 _SHAPES, _EXPRESSIONS = 100, 50  # DECA's, and the paper's, where DECA gives no start
 
 
@@ -43,10 +43,9 @@ def fit_face(
 
     Args:
         landmarks: where the face mesh lies on it.
-        keypoints: the clip's detections; their face mesh is read.
+        keypoints: the clip's detections; their face mesh is read, or without one the 68 face points.
         observations: made of the same keypoints; says which face points to trust.
-        settings: those of the face that is fitted first are read; ``auto`` is ``mesh`` where the estimator
-            gave a face mesh.
+        settings: those of the face that is fitted first are read; ``auto`` is ``mesh``.
         log: told in a line each what was fitted, or why nothing was, and how files were matched.
         source: all frames of the footage, which names of files mean; None: their numbers are frame numbers.
 
@@ -60,7 +59,8 @@ def fit_face(
         log("face first: switched off")
         return None
     with threads(1), torch.no_grad():
-        model = face_model(body, landmarks.face_mesh)
+        flat = settings.face != "flame" and int(observations.of("face").sum()) == _FACE_POINTS
+        model = face_model(body, landmarks.whole_body[FACE] if flat else landmarks.face_mesh)
         if settings.face == "flame":
             from stages.fit.face.from_flame import face_from_flame  # brings trimesh: a second
 
@@ -72,7 +72,7 @@ def fit_face(
             assert parameters is not None  # the settings ask for one of the two
             target = face_from_flame(model, body, flame, parameters)
         else:
-            target = _from_mesh(model, keypoints, observations, views)
+            target = _from_keypoints(model, keypoints, observations, views)
     if target is None:
         log(f"face first: {_why_not(settings, observations)}")
         return None
@@ -100,7 +100,7 @@ def _seen(
 ) -> tuple[FaceModel, Tensor, Tensor]:
     """The face points that were detected: where they lie, pixels [T, F, 2] and mask [T, F]."""
     of = observations.of("face")
-    deep = int(of.sum()) == _MESH_POINTS
+    deep = int(of.sum()) != _FACE_POINTS
     model = face_model(body, landmarks.face_mesh if deep else landmarks.whole_body[FACE])
     points = keypoints.face_mesh[..., :2] if deep else keypoints.whole_body[:, FACE, :2]
     return model, torch.from_numpy(points)[:, model.rows], observations.mask[:, of][:, model.rows]
@@ -120,7 +120,8 @@ def _fitted(
 
     model, pixels, mask = seen
     if start is None:
-        start = unknown_parameters(len(pixels), _SHAPES, _EXPRESSIONS)
+        most = (flame.shape_directions.shape[2], flame.expression_directions.shape[2])
+        start = unknown_parameters(len(pixels), min(_SHAPES, most[0]), min(_EXPRESSIONS, most[1]))
     points = flame_points(model, body, flame)
     fit = fit_flame(points, start, pixels, mask, views, settings.lambda_flame_init)
     before, after = (float(error.nanmean()) for error in (fit.start_error, fit.error))
@@ -130,19 +131,18 @@ def _fitted(
     return fit.parameters
 
 
-def _from_mesh(
+def _from_keypoints(
     model: FaceModel, keypoints: Keypoints, observations: Observations, views: CameraBatch
 ) -> FaceTarget | None:
     mask = observations.mask[:, observations.of("face")]
-    if mask.shape[1] != _MESH_POINTS or not mask.any():
+    if not mask.any():
         return None
-    mesh = torch.from_numpy(keypoints.face_mesh[..., :3])[:, model.rows]
-    return face_from_mesh(model, mesh, mask[:, model.rows], views)
+    deep = mask.shape[1] == _MESH_POINTS
+    points = keypoints.face_mesh[..., :3] if deep else keypoints.whole_body[:, FACE, :2]
+    return face_from_mesh(model, torch.from_numpy(points)[:, model.rows], mask[:, model.rows], views)
 
 
 def _why_not(settings: FitSettings, observations: Observations) -> str:
     if settings.face == "flame":
         return "left out, for no face was found in any frame"
-    if int(observations.of("face").sum()) != _MESH_POINTS:
-        return "left out, for the keypoints hold no face mesh"
     return "left out, for no frame shows enough of a face"

@@ -17,9 +17,6 @@ from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.calibration import Calibration, pinhole_lens
 from stages.ingest.video import PICTURES, Clip, clip_frames
 
-SHOT_STEP = 100_000
-"""Frame numbers of the n-th further shot begin at n times this."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Shot:

@@ -32,12 +32,13 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from pipeline.clip.records import SHOT_STEP
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import inside, read_npy
 from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Calibration, check_rotation
 from stages.ingest.cameras.extrinsics import to_upright_world
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, entry, lacking, numbers, read_array
+from stages.ingest.datasets.recording import Recording, Shot, entry, lacking, numbers, read_array
 from stages.ingest.datasets.smplx_poses import SMPL_ROOT, smpl_poses
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import folder_clip
