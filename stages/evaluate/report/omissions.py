@@ -54,7 +54,7 @@ def _of_the_clip(footage: Footage) -> list[Omission]:
     dropped = [(reason, count) for reason, count in sorted(footage.dropped.items()) if count]
     found = [Omission(_count(count, "frame"), reason) for reason, count in dropped]
     if footage.people > 1:
-        why = f"{footage.people} people were noticed; the largest and most central one was followed"
+        why = f"{footage.people} people were noticed; one was followed, ingest.person chooses another"
         found.append(Omission("Other people", why))
     if footage.scale < 1:
         why = f"frames were stored at {footage.scale:.2f} of their size (ingest.long_side)"
