@@ -38,6 +38,7 @@ from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
+from stages.fit.settings import FitSettings
 from stages.fit.smoothing import smooth, window_of
 
 RESIDUALS_SCHEMA = pa.schema(
@@ -62,8 +63,7 @@ def _run(context: Context) -> None:
     context.timing("registration_cpu_seconds", round(time.process_time() - cpu, 2))
     context.timing("curve_seconds", [[step, round(at, 3)] for step, at in fitted.seconds])
     times = frame_times(fitted.poses.frames, read_footage(ingest / "footage.json"))
-    seconds = 0.0 if context.settings.given == "keep" else context.settings.smoothing_seconds
-    smoothed = smooth(fitted.poses, window_of(seconds, times), times=times)
+    smoothed = published_poses(fitted, context.settings, times)
     judge_fit(context, body, fitted, smoothed, cameras)
     means = group_means(fitted.error, fitted.observations)
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
@@ -71,13 +71,25 @@ def _run(context: Context) -> None:
     write_identity(context.output / "identity.safetensors", fitted.identity, body)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
-    registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
+    source = "given" if context.settings.given == "keep" else context.settings.face
+    registered = {"source": source, "frames": len(smoothed), "registered": fitted.face_frames}
     write_json(context.output / "face.json", registered)  # what the plan says of face registration
     fitted.curve.write(context.output / "curve.parquet")
     write_template(context.output / "template.ply", body, fitted.identity)
     start = time.monotonic()
     write_overlays(context, body, fitted.identity, smoothed, cameras)
     context.timing("overlay_seconds", round(time.monotonic() - start, 2))
+
+
+def published_poses(fitted: Registration, settings: FitSettings, times: np.ndarray) -> Poses:
+    """The poses that are published: smoothed, but for eyes, steadied on their own, and for kept poses."""
+    if settings.given == "keep":
+        return fitted.poses
+    smoothed = smooth(fitted.poses, window_of(settings.smoothing_seconds, times), times=times)
+    if fitted.eyes is None:
+        return smoothed
+    expression, rotation = fitted.eyes.applied(smoothed.expression, smoothed.rotation)
+    return dataclasses.replace(smoothed, expression=expression, rotation=rotation)
 
 
 def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -> Registration:
@@ -111,7 +123,10 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
             footage.all_frames,
             times,
         )
-    return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
+    if kept is None:
+        return fitted
+    identity, poses = kept  # whose face is as registered as the rest of it
+    return dataclasses.replace(fitted, identity=identity, poses=poses, face_frames=int(poses.valid.sum()))
 
 
 def judge_fit(

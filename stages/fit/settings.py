@@ -28,16 +28,19 @@ class FitSettings:
     masked: bool = setting(True, "m of Eq. 2; false trusts every detection, also outside the picture")
     score_threshold: Fraction = setting(0.4, "tau: keypoints that score less are masked (Eq. 2)")
     betas: Coefficients = setting(100, "shape coefficients, as many of these as the body has")
+    expressions: Coefficients = setting(1000, "coefficients of the expression, likewise; the paper has 50")
     joint_offsets: bool = setting(True, "fit Delta J")
     face_offsets: bool = setting(True, "fit Delta V_face, where the face is seen")
     lambda_init: Weight = setting(0.1, "weight of staying near the initial pose (Eq. 1)")
     lambda_sface: Weight = setting(1.0, "weight of the distance to the face that was fitted first (Eq. 1)")
+    lambda_lids: Weight = setting(1.0, "weight of the lids' gaps against the priors; 0: lids as other points")
+    lambda_gaze: Weight = setting(1.0, "weight of the irises' places against the priors; 0: as other points")
     lambda_sreg: Weight = setting(1.0, "weight of shape, joint offsets and left-right symmetry (Eq. 1)")
     smoothness: Weight = setting(1.0, "factor on accelerations and velocities")
 
     # Where it starts
     face: Literal["auto", "mesh", "flame", "off"] = setting(
-        "auto", "the face that is fitted first: the estimator's mesh, FLAME's, none, or as there is"
+        "auto", "the face that is fitted first: the estimator's (its mesh, or its 68 points), FLAME's, none"
     )
     face_init: str = setting("", "folder of DECA's flame_params/ and shape_param.json, for face=flame")
     flame_model: str = setting("", "FLAME model file of the user's own, for face=flame")

@@ -209,3 +209,21 @@ def face_edge_loss(points: Tensor, target: Tensor, edges: Tensor) -> Tensor:
         return (places[edges[:, 0]] - places[edges[:, 1]]).norm(dim=-1)
 
     return (lengths(points) - lengths(target)).abs()
+
+
+def tie_of_two(seen: Tensor, weight: Tensor, tie: Tensor) -> Tensor:
+    """The pair c that is least in sum_e weight_e (c_e - seen_e)^2 + tie (c_0 - c_1)^2.
+
+    Args:
+        seen, weight: [T, 2], weights above 0.
+        tie: [T], how strongly both are held together.
+
+    Returns:
+        [T, 2].
+    """
+    first, second = weight.unbind(1)
+    determinant = first * second + tie * (first + second)
+    pulls = weight * seen
+    both = tie * pulls.sum(1)
+    pair = torch.stack([second * pulls[:, 0] + both, first * pulls[:, 1] + both], dim=1)
+    return pair / determinant[:, None]

@@ -5,7 +5,7 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=6,
+    version=7,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from pipeline.body.joints import JOINT_NAMES
+from pipeline.motion.novel_motion import motion_poses
 from pipeline.orbit_cameras import relaxed_pose
 from pipeline.run.versions import PACKAGES, commit, package_version, versions
-from stages.evaluate.report.videos import motion_pictures, motion_poses
+from stages.evaluate.report.videos import motion_pictures
 from stages.evaluate.verdict import ClipCoverage, limits, quality, turned, verdict
 from tests.made.blob import stand_in
 

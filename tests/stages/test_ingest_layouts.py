@@ -175,7 +175,7 @@ def test_zju_as_one_video(tmp_path, shown, bend):
     folder = writers.zju(tmp_path / "my_377", shown, bend)
     frames = [5 * row for row in range(COUNT)]
     for extra in set(range(frames[-1] + 1)) - set(frames):  # every frame is read as a video
-        for kind in ("Camera_B1", "mask/Camera_B1"):
+        for kind in ("images/00", "mask/00"):
             suffix = "png" if kind.startswith("mask") else "jpg"
             source = folder / kind / f"{extra // 5 * 5:06d}.{suffix}"
             (folder / kind / f"{extra:06d}.{suffix}").write_bytes(source.read_bytes())

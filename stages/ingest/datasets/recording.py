@@ -62,6 +62,20 @@ def files_of(folder: Path, clip: Clip, suffixes: Sequence[str] = PICTURES) -> di
     return match_files(folder, suffixes, clip_frames(clip))[0] or None
 
 
+def lacking(what: str, found: int, frames: int, where: str) -> str:
+    """A note on files that a layout promises; empty where every frame has one.
+
+    Args:
+        what: their name in the plural.
+        found: how many there are.
+        frames: of the clip; 0 where it does not say how many it has.
+        where: the folders that were looked into.
+    """
+    if not found:
+        return f"no {what} in {where}"
+    return f"{what} in {where} for {found} of {frames} frames" if found < frames else ""
+
+
 _PER_FRAME = ("rotation", "expression", "transl", "valid", "hand_pca")
 
 
