@@ -23,7 +23,7 @@ REACH = 0.6  # how far a person may move between two searches, in torso lengths
 GROWTH = 2.0  # and grow or shrink
 PERSISTENT = 0.2  # a track seen in a smaller part of the searches is a false alarm
 LOST = 4  # searches after which a track ends
-ALIKE, STRANGE = 0.6, 0.35  # overlap of colours from which two are one person, and under which they are not
+ALIKE, STRANGE = 0.78, 0.35  # overlap of colours from which two are one person, and under which they are not
 STILL, LIVELY = 1.5, 3.0  # grey levels under which a picture hangs still; times that by which another moves
 _PICTURE = 0.02  # weight of a picture on a wall
 

@@ -120,13 +120,20 @@ def _of_the_poses(
         frames = ", ".join(map(str, refined.stopped))
         why = f"the loss of {frames} was not finite: shown in the pose of the fit, under both names"
         return [Omission("Refinement of " + _count(len(refined.stopped), "test pose"), why)]
-    if refined.poses or not split.test:
+    if refined.poses:
+        left = len(split.test) - len(refined.poses)
+        why = f"its cost is bounded by evaluate.refine_share={settings.refine_share:g}"
+        return [Omission(f"Refinement of {_count(left, 'held-out pose')}", why)] if left else []
+    if not split.test:
         return []
     asked = settings.choices.refine_test_poses
     named = (
         "refine_test_poses=off" if settings.refine_test_poses == asked else f"protocol={settings.protocol}"
     )
-    reason = plan[EFFECT].why if asked == PLAN else f"evaluate.{named}"
+    bounded = (
+        f"{plan[EFFECT].why}; evaluate.refine_share={settings.refine_share:g} of training's work allows none"
+    )
+    reason = f"evaluate.{named}" if asked != PLAN else plan[EFFECT].why if plan[EFFECT].forced else bounded
     why = (
         "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels: "
         + reason
