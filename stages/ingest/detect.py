@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,7 @@ class DetectedClip:
         dropped: reason -> frames.
         people: how many people there are at once; 0 where nobody counted.
         stills: whether the frames are single pictures, see ``stills.py``.
+        subject: the person who was followed; None where nobody searched.
     """
 
     keypoints: Keypoints
@@ -60,6 +62,7 @@ class DetectedClip:
     dropped: dict[str, int]
     people: int
     stills: bool = False
+    subject: people.Track | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,15 +206,24 @@ class FrameDetector:
         return tuple(masks)
 
 
-def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: Path) -> DetectedClip:
+def detect(
+    context: Context,
+    clip: Clip,
+    sources: DetectionSources,
+    raw_masks: Path,
+    choose: Callable[[Sequence[people.Track]], people.Track] | None = None,
+) -> DetectedClip:
     """Detect the person in every frame; write kept frames to ``output/frames``, raw masks to ``raw_masks``.
+
+    Args:
+        choose: finds the subject of a rig's first camera among the people of this one.
 
     Raises:
         UserError: a damaged frame, or a keypoint or mask file that is damaged or of no frame.
     """
     settings = context.settings
     stills = are_stills(clip, settings)
-    search = search_people(context, clip, sources, stills)
+    search = search_people(context, clip, sources, stills, choose)
     everyone, total = search.everyone, search.total
     sources = with_mask_form(context, clip, sources)
     singly = detects_singly(clip, settings, stills)
@@ -262,6 +274,7 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
         dropped=dropped_for,
         people=everyone.count,
         stills=stills,
+        subject=everyone.subject,
     )
 
 

@@ -12,7 +12,7 @@ the subject's part only.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -98,6 +98,7 @@ def track_people(
     height: int,
     number: int = 0,
     name: str = "the clip",
+    choose: Callable[[Sequence[Track]], Track] | None = None,
 ) -> ClipPeople:
     """The tracks of all people, and which of them is the subject's.
 
@@ -106,6 +107,7 @@ def track_people(
         width, height: the picture's size in pixels.
         number: of the person who is meant, counted from 1 by prominence; 0 for the first.
         name: of the clip, for messages.
+        choose: picks the subject among the people, where no number does; the most prominent by default.
 
     Raises:
         UserError: there is no person of that number.
@@ -119,7 +121,7 @@ def track_people(
     if not people:
         return ClipPeople(None, (), 0)
     everyone = by_prominence(people, width, height)
-    subject = everyone[max(number - 1, 0)]
+    subject = choose(everyone) if choose is not None and not number else everyone[max(number - 1, 0)]
     count = max(sum(frame in track.people for track in people) for frame, _ in found)
     others = tuple(track for track in everyone if track is not subject)
     frames = [frame for frame, _ in found]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -38,8 +39,17 @@ class FoundPeople:
     total: int
 
 
-def search_people(context: Context, clip: Clip, sources: DetectionSources, stills: bool) -> FoundPeople:
+def search_people(
+    context: Context,
+    clip: Clip,
+    sources: DetectionSources,
+    stills: bool,
+    choose: Callable[[Sequence[people.Track]], people.Track] | None = None,
+) -> FoundPeople:
     """The first pass over a clip: its cuts, and the people in some frames of the shot that is taken.
+
+    Args:
+        choose: finds the subject of a rig's first camera among the people of this one.
 
     Raises:
         UserError: there is no person or no shot of the number that a setting names.
@@ -69,9 +79,12 @@ def search_people(context: Context, clip: Clip, sources: DetectionSources, still
     taken = _take_shot(context, clip, shots, found) if frames else None
     inside = [(frame, seen) for frame, seen in found if taken is None or frame in taken]
     name = clip.path.name
-    everyone = people.track_people(inside, clip.width, clip.height, settings.person, name)
+    number = settings.person if choose is None else 0
+    everyone = people.track_people(inside, clip.width, clip.height, number, name, choose)
     if len(everyone.everyone) > 1:
-        context.log(describe_people(everyone, settings.person, clip))
+        why = "ingest.person asked for it" if number else "who fills most of the clip and moves"
+        why = why if choose is None else "the person of the first camera"
+        context.log(describe_people(everyone, why, clip))
     return FoundPeople(everyone, taken, len(frames))
 
 
@@ -92,7 +105,7 @@ def _take_shot(
     return taken
 
 
-def describe_people(everyone: people.ClipPeople, number: int, clip: Clip) -> str:
+def describe_people(everyone: people.ClipPeople, why: str, clip: Clip) -> str:
     """The log's line on several people: where each is, and who is kept."""
     kept = everyone.everyone.index(everyone.subject) + 1  # type: ignore[arg-type]
     listed = []
@@ -102,7 +115,6 @@ def describe_people(everyone: people.ClipPeople, number: int, clip: Clip) -> str
         side = "left" if across < 1 / 3 else "middle" if across < 2 / 3 else "right"
         hung = ", hangs still" if people.hangs_still(track, everyone.everyone) else ""
         listed.append(f"{place} ({side}, frames {frames[0]} to {frames[-1]}{hung})")
-    why = "ingest.person asked for it" if number else "who fills most of the clip and moves"
     return (
         f"{clip.path.name}: {everyone.count} people at once: {', '.join(listed)}: number {kept} is kept, "
         f"{why}; ingest.person=NUMBER chooses another"

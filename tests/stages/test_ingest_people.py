@@ -9,9 +9,11 @@ import pytest
 from pipeline.clip.boxes import Box
 from pipeline.detection.mediapipe import Estimate
 from pipeline.errors import UserError
+from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
 from stages.ingest.cuts import FilmShot, choose_shot, film_shots, find_cuts
 from stages.ingest.people import Track, color_overlap, link_detections, track_people
 from stages.ingest.person_detector import Person, change_since, distinct, squares, torso_colors
+from stages.ingest.same_person import KnownPerson, rays_meet
 
 RED, GREEN = np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.1, 0.9])
 
@@ -184,3 +186,47 @@ def test_an_estimate_of_a_part_is_placed_in_the_whole():
     assert whole.body_mask.shape == (240, 400)
     assert tuple(np.argwhere(whole.body_mask)[0]) == (140, 220)
     np.testing.assert_array_equal(dataclasses.replace(part).world, whole.world)
+
+
+# The same person in another camera.
+
+
+def camera_at(angle, distance=4.0):
+    """A camera on a circle about the world's origin, looking at it."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotation = np.array([[cosine, 0, -sine], [0, 1.0, 0], [sine, 0, cosine]])
+    lens = pinhole_lens(640, 480, (500.0, 500.0), (320.0, 240.0))
+    return CalibratedCamera(lens, rotation, np.array([0.0, 0.0, distance]))
+
+
+def seen_by(camera, places, first, colors=None):
+    """The track of somebody whose shoulders are at some places in the world."""
+    track = {}
+    for offset, place in enumerate(places):
+        x, y, z = camera.rotation @ place + camera.translation
+        pixel = np.array([320 + 500 * x / z, 240 + 500 * y / z])
+        track[first + offset] = Person(pixel + [0, 250 / z], pixel, 450 / z, 0.9, colors)
+    return Track(track)
+
+
+def test_lines_of_sight_find_the_person_in_another_camera():
+    walk = np.linspace(-0.5, 0.5, 6)
+    woman = np.stack([walk, 0 * walk, 0 * walk - 0.8], 1)
+    man = np.stack([-walk, 0 * walk, 0 * walk + 0.8], 1)
+    one, other = camera_at(0.0), camera_at(1.2)
+    mine, theirs = (seen_by(camera, woman, 0).at(0).shoulders for camera in (one, other))
+    lengths, miss = rays_meet(one, mine, other, theirs)
+    assert miss < 1e-9 and lengths[0] == pytest.approx(np.linalg.norm(woman[0] - [0, 0, -4.0]))
+    for subject, stranger in ((woman, man), (man, woman)):
+        known = KnownPerson(seen_by(one, subject, 0), one, 0)
+        tracks = [seen_by(other, who, 100_000) for who in (stranger, subject)]
+        assert known.among(tracks, other, 100_000) is tracks[1]
+
+
+def test_without_a_calibration_colours_find_the_person():
+    known = KnownPerson(Track({0: person(50, colors=RED)}), None, 0)
+    tracks = [Track({0: person(50, 60, colors=GREEN)}), Track({0: person(150, 20, colors=RED)})]
+    assert known.among(tracks, None, 100_000) is tracks[1]
+    looks = [(frame, [person(50, 60, colors=GREEN), person(150, 30, colors=RED)]) for frame in range(4)]
+    chosen = track_people(looks, 200, 100, choose=lambda people: known.among(people, None, 0))
+    assert chosen.subject.at(0).shoulders[0] == 150 and len(chosen.others) == 1
