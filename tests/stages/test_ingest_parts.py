@@ -24,7 +24,7 @@ from stages.ingest.masks import (
     selfie_share,
     write_segmentations,
 )
-from stages.ingest.people import Person
+from stages.ingest.person_detector import Person
 from stages.ingest.split import split_frames
 from tests.made.videos import walking_blob
 
