@@ -48,6 +48,7 @@ from stages.evaluate.methods import (
     pose_gradient_animation,
 )
 from stages.evaluate.other_cameras import camera_folders, read_true_surface, score_other_cameras
+from stages.evaluate.refinement_allowance import allowance, is_asked_for, steps_of
 from stages.evaluate.report.omissions import omissions
 from stages.evaluate.report.page import ReportContents, video_uri, write_report
 from stages.evaluate.report.pictures import (
@@ -68,7 +69,6 @@ from stages.evaluate.test_pose_refinement import (
     NOT_REFINED,
     PictureLoss,
     RefinedTestPoses,
-    is_called_for,
     refine,
     write_refined,
 )
@@ -268,15 +268,17 @@ def score(
 def refine_test_poses(
     context: Context, clip: EvaluatedClip, plan: Plan, follow: Animate, background: str
 ) -> RefinedTestPoses:
-    """Refines the held-out frames' poses where that is called for, and publishes them."""
+    """Refines the held-out frames' poses as far as that is allowed, and publishes them."""
     settings: EvaluateSettings = context.settings
-    frames = clip.split.test
-    if not frames or not is_called_for(settings, plan):
+    curve = read_curve(context.inputs["train"] / "curve.parquet", "run the train stage again")
+    allowed = allowance(clip, settings, is_asked_for(settings, plan), steps_of(curve))
+    if not allowed.frames:
         return NOT_REFINED
+    context.log(allowed.why)
     start = time.monotonic()
-    with context.progress(len(frames), "refining test poses") as progress:
-        perceptual = refinement_lpips(context)
-        refined = refine(clip, follow, background, settings.refine_steps, progress.advance, perceptual)
+    with context.progress(len(allowed.frames), "refining test poses") as progress:
+        perceptual, advance = refinement_lpips(context), progress.advance
+        refined = refine(clip, follow, background, allowed.steps, advance, perceptual, allowed.frames)
     context.timing("refinement_seconds", time.monotonic() - start)
     write_refined(context.output / "test_poses.parquet", refined)
     context.log(refinement_cost(context, refined))

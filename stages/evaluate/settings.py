@@ -37,6 +37,7 @@ from pipeline.config.settings import (
 
 Rounds = Annotated[int, Field(ge=1, le=1_000_000)]
 Share = Annotated[float, Field(gt=0, lt=1)]
+ShareOrNone = Annotated[float, Field(ge=0, le=100)]
 TextureSide = Annotated[int, Field(ge=16, le=8192)]
 Auto = Literal["auto"]
 
@@ -65,6 +66,9 @@ class EvaluateSettings:
         "auto: as the protocol says",
     )
     refine_steps: Rounds = setting(60, "steps of that refinement, a frame")
+    refine_share: ShareOrNone = setting(
+        0.2, "what it may cost where nothing asks for it, of training's steps times pixels; 0: nothing"
+    )
     refine_lpips: Weight = setting(0.0, "weight of LPIPS in it, beside 0.8 L1 and 0.2 SSIM")
     refine_lpips_network: LpipsNetwork = setting("vgg", "its backbone")
     lpips_networks: tuple[LpipsNetwork, ...] = setting(

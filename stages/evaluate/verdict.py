@@ -141,9 +141,9 @@ def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
         text = f"masks (the truth itself scores {ceiling:.1f} dB under a second mask)"
         # A score at the ceiling can hardly rise, whatever else is mended.
         found.append((100.0 if margin < NEAR_CEILING else 0.0, text))
-    refined = means.get(REFINED, {}).get("psnr")
-    if refined is not None:
-        found.append((refined - avatar, f"poses (refining them gains {refined - avatar:.1f} dB)"))
+    gain = summary["differences"].get(REFINED, {}).get("psnr")  # on the frames that were refined
+    if gain is not None:
+        found.append((-gain["mean"], f"poses (refining them gains {-gain['mean']:.1f} dB)"))
     trained = summary["means"].get(TRAINING, {}).get(AVATAR, {}).get("psnr")
     if trained is not None:
         text = f"new frames ({trained - avatar:.1f} dB below those it learnt from)"

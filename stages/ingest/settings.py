@@ -55,6 +55,10 @@ class IngestSettings:
         -1, "the first frame's number in the names of files that are not named as the frames; -1: as they say"
     )
     poses: str = setting("", "file of poses to start from that lies elsewhere than the footage: SHOW's .pkl")
+    person: CountOrNone = setting(
+        0, "which person is kept, counted from 1 as the log lists them; 0: who fills most of it and moves"
+    )
+    shot: CountOrNone = setting(0, "which shot of a clip with cuts is taken, counted from 1; 0: the longest")
     test_fraction: TestFraction = setting(
         0.1, "the part of the kept frames, at the clip's end, that is held out"
     )

@@ -28,6 +28,8 @@ def summary(avatar=30.0, over=None, train=None, **methods):
     gains = {name: {"psnr": dict(zip(keys, each, strict=True))} for name, each in (over or {}).items()}
     for name in gains:
         means["test"].setdefault(name, {"psnr": avatar - gains[name]["psnr"]["mean"]})
+    if "avatar_refined" in methods:
+        gains["avatar_refined"] = {"psnr": {"mean": avatar - methods["avatar_refined"]}}
     return {"means": means, "differences": gains, "confidence": 0.95, "frames": {"test": 7}}
 
 

@@ -122,9 +122,7 @@ def test_correctives_of_the_body_are_told_by_bases_too(body):
     transforms = joint_transforms(pose.rotation[None], linear.joints, linear.parents)[0]
     placed, _ = baked.skinning_tables.place(transforms, linear.points, pose.transl)
     assert (linear.points - baked.constants.points).abs().max() > 1e-3
-    assert torch.allclose(
-        placed, baked.gaussians(pose).means, atol=1e-4
-    )  # stored in bfloat16
+    assert torch.allclose(placed, baked.gaussians(pose).means, atol=1e-4)  # stored in bfloat16
 
 
 def test_equal_avatars_give_equal_bytes_and_a_motion_of_one_frame_is_kept(body):
