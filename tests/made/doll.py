@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from pipeline.avatar import Architecture, Avatar, save_avatar
-from pipeline.body import mean_identity
+from pipeline.body import mean_identity, read_poses
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from stages.animate.run import run
 from stages.animate.settings import AnimateSettings
 from tests.made.body import open_body
@@ -57,4 +58,6 @@ def make_studio(root: Path, gated: bool = False) -> Studio:
     write_subject(root)
     (root / "train").mkdir()
     save_avatar(root / "train" / "avatar.safetensors", awake_avatar(gated))
+    frames = read_poses(root / "fit" / "poses.parquet").frames
+    write_keypoints(root / "ingest" / "keypoints.parquet", empty_keypoints(frames))
     return Studio(root)
