@@ -14,6 +14,10 @@ def idle(settings: FitSettings) -> dict[str, str]:
     if settings.given == "keep":
         remedy = "poses that are kept are not fitted: leave out fit.given=keep"
         found.update(dict.fromkeys(("iterations", "learning_rate", "smoothing_seconds", "face"), remedy))
+    if not settings.flame_fit or settings.face != "flame":
+        found["lambda_flame_init"] = "FLAME is not fitted: set fit.face=flame and fit.flame_fit=true"
+    if settings.face != "flame":
+        found["flame_fit"] = "there is no FLAME to fit: set fit.face=flame and fit.flame_model"
     if not settings.iterations:
         found["learning_rate"] = "no step is taken: raise fit.iterations"
     return found

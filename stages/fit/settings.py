@@ -44,6 +44,10 @@ class FitSettings:
     )
     face_init: str = setting("", "folder of DECA's flame_params/ and shape_param.json, for face=flame")
     flame_model: str = setting("", "FLAME model file of the user's own, for face=flame")
+    flame_fit: bool = setting(
+        False, "fit FLAME to the 2D face points first (supplement A), for face=flame; face_init is its start"
+    )
+    lambda_flame_init: Weight = setting(0.1, "weight of its distance from DECA's start")
     pose_init: str = setting(
         "", "folder of SMPLest-X poses, smplx_init/*.json; else the estimator's landmarks"
     )
@@ -70,8 +74,8 @@ class FitSettings:
 
     @model_validator(mode="after")
     def _fit_together(self) -> FitSettings:
-        if self.face == "flame" and not (self.face_init and self.flame_model):
-            raise ValueError("fit.face=flame needs fit.face_init and fit.flame_model")
+        if self.face == "flame" and not (self.flame_model and (self.face_init or self.flame_fit)):
+            raise ValueError("fit.face=flame needs fit.flame_model, and fit.face_init or fit.flame_fit=true")
         if self.face != "flame" and (self.face_init or self.flame_model):
             raise ValueError("fit.face_init and fit.flame_model are not used: set fit.face=flame")
         return self

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from pipeline.clip.background import learn_background, log_odds, subtract_background
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints
-from stages.ingest.background import learn_background, log_odds, subtract_background
 from stages.ingest.mask_edges import follow_edges
 from stages.ingest.mask_smoothing import smooth_masks
 

@@ -54,6 +54,8 @@ class Term(Generic[Source]):
         generated: the setting that weighs it on generated frames instead.
         captured_only: it is not taken of generated frames.
         since: the setting with the fraction of the run from which it takes part; from the start if empty.
+        needs: the setting without which it is not taken.
+        share: which part of the weight it has in a frame; all of it if None.
         times: the setting with how many renderings of a frame it stands for; of generated frames always the
             pictures'.
         every: the setting with the draws for one that it is taken of, with as many times the weight, so
@@ -77,6 +79,8 @@ class Term(Generic[Source]):
     every: str = ""
     mask: Callable[[Source], Tensor | None] | None = None
     count: Callable[[Source], int] | None = None
+    needs: str = ""
+    share: Callable[[Source], float] | None = None
 
     @property
     def by_part(self) -> bool:
@@ -108,6 +112,8 @@ class Term(Generic[Source]):
         """The first iteration that it takes part in; None where it has no weight or never begins."""
         if not any(getattr(settings, name) for name in self.weights):
             return None
+        if self.needs and not getattr(settings, self.needs):
+            return None
         return schedule.first_iteration(settings, getattr(settings, self.since)) if self.since else 0
 
     def takes_part(self, settings: TrainSettings, iteration: int, position: int, generated: bool) -> bool:
@@ -129,8 +135,10 @@ class Term(Generic[Source]):
 FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
     # Pictures over the drawn background: L_1, L_ssim and L_lpips
     Term("l1", losses.l1, lambda f: (f.image, f.target), "l1", generated="generated",
-         times="l1_renderings"),
-    Term("ssim", ssim_loss, lambda f: (f.image, f.target), "ssim", generated="generated",
+         times="l1_renderings", share=lambda f: f.color_share),
+    Term("l1_scene", losses.l1, lambda f: f.over_scene or (None,), "l1", times="l1_renderings",
+         captured_only=True, needs="scene_share", share=lambda f: f.scene_share),
+    Term("ssim", ssim_loss, lambda f: f.pictures, "ssim", generated="generated",
          times="renderings"),
     Term("lpips", losses.lpips, lambda f: (f.network, *f.crops), "lpips", generated="generated",
          since="lpips_from", times="renderings", every="lpips_every"),
@@ -193,6 +201,7 @@ class TrainingObjective:
         data: what it is compared with.
         settings: the weights.
         texture: [N, 3], the data's, where the avatar is; None where no term asks for it.
+        scene: behind the person, the data's, where the avatar is; None where it is not compared.
         network: LPIPS; None where it has no weight.
         on_frame: called with each rendered frame's pose and view.
         visibility_cache: which Gaussians each frame showed when it was last drawn.
@@ -226,6 +235,7 @@ class TrainingObjective:
             raise ValueError("the face term needs a texture")
         self.avatar, self.poses, self.data, self.settings = avatar, poses, data, settings
         self.texture = moved(data.texture, avatar.device)
+        self.scene = None if data.scene is None else data.scene.to(avatar.device)
         self.network = None if network is None else network.to(avatar.device)
         self.on_frame = on_frame
         count = len(avatar.surfaces[-1].canonical)
@@ -283,6 +293,8 @@ class TrainingObjective:
             network=self.network,
             crop_side=self.settings.lpips_crop,
             metres=self.settings.scale_smoothness == "metres",
+            scene=self.scene,
+            scene_share=self.settings.scene_share,
         )
 
     def _evaluate(
@@ -300,7 +312,8 @@ class TrainingObjective:
                 continue
             mean = _reduced(term, source)
             if mean is not None:
-                found[term.name] = term.scalar_weight(self.settings, generated) * mean
+                weight = term.scalar_weight(self.settings, generated)
+                found[term.name] = (weight if term.share is None else weight * term.share(source)) * mean
         return found
 
     def _regions(self, surface: Surface) -> Regions:

@@ -219,6 +219,10 @@ class TrainSettings:
     l1_renderings: Factor = setting(1.0, "renderings of a captured frame that lambda_L1 stands for")
     renderings: Factor = setting(1.0, "the same of SSIM, LPIPS, face, and all of generated frames")
 
+    scene_share: Fraction = setting(
+        0.0, "share of L1, and all of SSIM and LPIPS, over the clip's own background where the camera stands"
+    )
+
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: Weight = setting(1e3, "smoothness of static and of all offsets together")
     laplacian_offset_face: Weight = setting(1e3, "the same on the face")

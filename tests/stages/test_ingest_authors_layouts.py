@@ -100,6 +100,16 @@ def test_gaussian_avatars_is_not_insta(tmp_path, shown):
         read(folder)
 
 
+def test_gaussian_avatars_is_told_by_its_index_too(tmp_path, shown):
+    folder = writers.insta(tmp_path / "union", shown)
+    table = json.loads((folder / "transforms.json").read_text())
+    for place, frame in enumerate(table["frames"]):
+        frame.update(flame_param_path=f"flame_param/{place:05d}.npz", camera_index=0, timestep_index=place)
+    (folder / "transforms.json").write_text(json.dumps(table))
+    with pytest.raises(UserError, match="GaussianAvatars"):
+        read(folder)
+
+
 @pytest.mark.parametrize("listed", [False, True])
 def test_show_in_pytorch3ds_camera(tmp_path, shown, listed):
     (shot,) = read(writers.talkshow(tmp_path / "clip", shown, listed=listed)).shots

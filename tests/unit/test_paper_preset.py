@@ -1,10 +1,11 @@
-"""The paper preset: its weights against ExAvatar's."""
+"""The paper preset: its weights against ExAvatar's, and all of its settings against docs/paper.md."""
 
 import pytest
 
 from pipeline.config.settings import read_toml
 from pipeline.config.workspace import REPOSITORY
 from stages.train.settings import TrainSettings
+from tools.paper_settings import PAGE, ROW, resolved, written
 
 # ExAvatar's weights: of one branch's pictures, and of regularisers with the number of branches they take.
 OVER_SCENE, WITH_FACE, OVER_COLOR = {"l1": 0.8, "ssim": 0.2, "lpips": 0.2}, {"l1": 0.8}, {"l1": 1.0}
@@ -21,6 +22,17 @@ REGULARISERS = {  # name: (body, hands, face, scalp) in ExAvatar's units, rows t
 }
 
 
+def test_docs_paper_lists_every_setting_of_the_preset_with_a_reason_where_it_differs():
+    """If this fails: python -m tools.paper_settings, and fill in the reasons."""
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == written(page)
+    quick, paper = resolved("quick"), resolved("paper")
+    reasons = dict(ROW.findall(page))
+    assert {name for name, reason in reasons.items() if reason.strip()} == {
+        name for name in paper if paper[name] != quick[name]
+    }
+
+
 @pytest.fixture(scope="module")
 def train():
     return TrainSettings(**read_toml(REPOSITORY / "data" / "presets" / "paper.toml")["train"])
@@ -30,6 +42,8 @@ def test_pictures_count_as_often_as_exavatar_compares_them(train):
     pictures = (OVER_SCENE, WITH_FACE, OVER_COLOR)
     total = {name: BRANCHES * sum(one.get(name, 0) for one in pictures) for name in OVER_SCENE}
     assert train.l1 * train.l1_renderings == pytest.approx(total["l1"])
+    over_scene = BRANCHES * (OVER_SCENE["l1"] + WITH_FACE["l1"])
+    assert train.scene_share == pytest.approx(over_scene / total["l1"], abs=1e-3)
     assert train.ssim * train.renderings == pytest.approx(total["ssim"])
     assert train.lpips * train.renderings == pytest.approx(total["lpips"])
     assert train.face * train.renderings == pytest.approx(BRANCHES * FACE)

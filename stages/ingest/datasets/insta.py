@@ -71,16 +71,16 @@ def recognises(folder: Path) -> bool:
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read an actor's folder; UserError where a file of it is malformed."""
     if _of_gaussian_avatars(source):
-        raise UserError(
-            f"{source} is a folder of GaussianAvatars (flame_param/), not of INSTA: "
-            "give one camera's pictures as a folder of their own, with ingest.layout=plain"
-        )
+        raise _another_layout(source)
     pictures = number_files(source / "images", PICTURES)
     clip = folder_clip(source / "images", pictures, 25.0)
     heads = read_tracker(source, clip)
     path, notes = source / "transforms.json", []
     if path.is_file():
-        views, axes = _views(source, parse_json(path, _REMEDY), path, clip)
+        table = parse_json(path, _REMEDY)
+        if any("flame_param_path" in frame for frame in _frames(table, path) if isinstance(frame, dict)):
+            raise _another_layout(source)
+        views, axes = _views(source, table, path, clip)
         notes.append(f"its cameras have {axes}'s axes")
         heads = heads or read_texts(source, clip, views)
         calibration = Calibration(path, "INSTA", views, metric=True, upright=False, by_frame=True)
@@ -96,6 +96,21 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     shot = Shot(clip, calibration, None, masks, "white", poses_of(heads))
     split = [_listed(source, part, clip) for part in ("train", "test")]
     return Recording("insta", (shot,), *split, notes=tuple(notes))
+
+
+def _another_layout(source: Path) -> UserError:
+    return UserError(
+        f"{source} is a folder of GaussianAvatars (FLAME in npz files, several cameras), not of INSTA: "
+        "give one camera's pictures as a folder of their own, with ingest.layout=plain"
+    )
+
+
+def _frames(table: Any, path: Path) -> list[Any]:
+    """The entries of a transforms file."""
+    frames = entry(table, "frames", path, _REMEDY)
+    if not isinstance(frames, list):
+        raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
+    return frames
 
 
 def _of_gaussian_avatars(folder: Path) -> bool:
@@ -114,6 +129,8 @@ def _tracked_camera(source: Path, heads: Mapping[int, TrackedHead], clip: Clip) 
 def _views(source: Path, table: Any, path: Path, clip: Clip) -> tuple[dict[str, CalibratedCamera], str]:
     """Frame number -> camera, and whose axes the file has."""
     entries = _entries(source, table, path, clip)
+    if not entries:
+        raise UserError(f"{path} names no picture of {clip.path}: {_REMEDY}")
     matrices = {
         number: read_array(frame, "transform_matrix", (4, 4), f"{path}, frame {number}", _REMEDY)
         for number, frame in entries.items()
@@ -162,10 +179,7 @@ def _lens(own: Mapping[str, Any], clip: Clip, where: str) -> Any:
 
 def _entries(source: Path, table: Any, path: Path, clip: Clip) -> dict[int, dict[str, Any]]:
     """Frame number -> its entry; each picture must lie inside the folder."""
-    frames = entry(table, "frames", path, _REMEDY)
-    if not isinstance(frames, list):
-        raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
-    named = {str(entry(frame, "file_path", path, _REMEDY)): frame for frame in frames}
+    named = {str(entry(one, "file_path", path, _REMEDY)): one for one in _frames(table, path)}
     for name in named:
         inside(source, name, path)
     match = match_names(named, clip_frames(clip), path)
