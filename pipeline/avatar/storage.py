@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pipeline.avatar.architecture import Architecture
+from pipeline.avatar.architecture import ON_REQUEST, Architecture
 from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.skinning_tables import OWN
 from pipeline.body import BodyModel, Identity
@@ -79,8 +79,11 @@ def _stored_name(name: str) -> str:
 def _described(architecture: Architecture) -> dict:
     """The sizes as JSON values; what an ablation alone asks for is written only where it was asked for."""
     sizes = dataclasses.asdict(architecture)
-    if not architecture.residual_moves:
-        del sizes["residual_moves"]
+    usual = Architecture()
+    for name in ON_REQUEST:
+        if sizes[name] == getattr(usual, name):
+            del sizes[name]
+    del sizes["plane_deviation"]
     if architecture.representation == "triplane":
         del sizes["representation"], sizes["bases"]
     return sizes

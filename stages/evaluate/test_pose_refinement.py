@@ -25,6 +25,9 @@ from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import Animate
 from stages.evaluate.settings import EvaluateSettings
 
+PictureLoss = Callable[[Tensor, Tensor], Tensor]
+"""A scalar of two images, [H, W, 3] each."""
+
 EFFECT = "test_time_refinement"  # the plan's name of it
 
 L1_WEIGHT, SSIM_WEIGHT = 0.8, 0.2  # Equation 9
@@ -57,7 +60,12 @@ def is_called_for(settings: EvaluateSettings, plan: Plan) -> bool:
 
 
 def refine(
-    clip: EvaluatedClip, animate: Animate, background: str, steps: int, advance: Callable[[], object]
+    clip: EvaluatedClip,
+    animate: Animate,
+    background: str,
+    steps: int,
+    advance: Callable[[], object],
+    perceptual: PictureLoss | None = None,
 ) -> RefinedTestPoses:
     """Refines the pose of every held-out frame.
 
@@ -67,12 +75,13 @@ def refine(
         background: what both images are composited on.
         steps: a frame.
         advance: called after each frame.
+        perceptual: a further loss of two images, weighted; the paper's L_lpips.
     """
     poses: dict[int, Pose] = {}
     stopped = []
     for frame in clip.split.test:
         fitted = clip.pose(frame)
-        refined = refined_pose(frame_loss(clip, animate, background, frame), fitted, steps)
+        refined = refined_pose(frame_loss(clip, animate, background, frame, perceptual), fitted, steps)
         if refined is None:
             stopped.append(frame)
         poses[frame] = refined or fitted
@@ -81,7 +90,11 @@ def refine(
 
 
 def frame_loss(
-    clip: EvaluatedClip, animate: Animate, background: str, frame: int
+    clip: EvaluatedClip,
+    animate: Animate,
+    background: str,
+    frame: int,
+    perceptual: PictureLoss | None = None,
 ) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
     camera, seconds = clip.camera(frame), clip.seconds.get(frame)
@@ -90,7 +103,8 @@ def frame_loss(
     def loss(pose: Pose) -> Tensor:
         rendering = render(animate(pose, seconds), camera)
         image = over(rendering.color, rendering.alpha, background)
-        return image_loss(image, truth.to(image), BACKGROUNDS[background])
+        plain = image_loss(image, truth.to(image), BACKGROUNDS[background])
+        return plain if perceptual is None else plain + perceptual(image, truth.to(image))
 
     return loss
 

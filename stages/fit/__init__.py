@@ -13,7 +13,7 @@ def idle(settings: FitSettings) -> dict[str, str]:
         found["given"] = "fit.pose_init is started from: leave out one of the two"
     if settings.given == "keep":
         remedy = "poses that are kept are not fitted: leave out fit.given=keep"
-        found.update(dict.fromkeys(("iterations", "learning_rate", "smoothing_window", "face"), remedy))
+        found.update(dict.fromkeys(("iterations", "learning_rate", "smoothing_seconds", "face"), remedy))
     if not settings.iterations:
         found["learning_rate"] = "no step is taken: raise fit.iterations"
     return found
@@ -21,7 +21,7 @@ def idle(settings: FitSettings) -> dict[str, str]:
 
 STAGE = Stage(
     name="fit",
-    version=8,
+    version=9,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={

@@ -11,7 +11,10 @@ import torch
 from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, Landmarks, Poses
+from pipeline.body.eyes import eyeball, shut_expressions, with_eyeballs
+from pipeline.body.joints import LEFT_EYE, RIGHT_EYE
 from pipeline.clip.camera import Camera
+from pipeline.clip.clock import times_of_numbers
 from pipeline.clip.curves import Curve
 from pipeline.clip.frame_files import ClipFrames
 from pipeline.clip.keypoints import Keypoints
@@ -20,7 +23,8 @@ from pipeline.numba_kernels import threads
 from pipeline.pose_files import InitialPoses
 from stages.fit.adam import Recorder, optimise
 from stages.fit.camera_batch import CameraBatch, stack
-from stages.fit.face import fit_face
+from stages.fit.eyes import FittedEyes, fit_eyes
+from stages.fit.face import FaceTarget, fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.initialise_from_poses import initial_facing, initial_from_files
@@ -42,7 +46,8 @@ class Registration:
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
         curve: loss and reprojection error over the steps.
         seconds: (step, seconds since the start) at the curve's points.
-        face_frames: in how many frames a face was fitted first; 0 where none was.
+        face_frames: in how many frames a face was fitted first, or an expression was given; 0 in none.
+        eyes: lids and gaze, which the poses hold already; None where no eye was seen.
     """
 
     identity: Identity
@@ -52,6 +57,7 @@ class Registration:
     curve: Curve
     seconds: tuple[tuple[int, float], ...]
     face_frames: int = 0
+    eyes: FittedEyes | None = None
 
 
 @threads(1)  # sums of many threads differ in their last digits, also those before and after Adam
@@ -65,6 +71,7 @@ def register(
     start: InitialPoses | None = None,
     log: Callable[[str], None] = lambda note: None,
     source: ClipFrames | None = None,
+    times: np.ndarray | None = None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -74,15 +81,21 @@ def register(
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.
         source: all frames of the footage, which names of given files mean.
+        times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
     """
+    directions = body.expression_directions[..., : settings.expressions]
+    body = dataclasses.replace(body, expression_directions=directions)
     views = views_of(keypoints, cameras)
-    keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
+    times = times_of_numbers(keypoints.frames) if times is None else times
+    keypoints = _without_outlier_frames(keypoints, times, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
-    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
+    observations = observe(
+        keypoints, landmarks, settings.score_threshold, size, settings.masked, facing, times
+    )
     target = fit_face(body, landmarks, keypoints, observations, views, settings, log, source)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
@@ -100,21 +113,58 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
-    objective = RegistrationObjective(body, observations, model, views, initial, movable, settings, face)
+    objective = RegistrationObjective(
+        body, observations, model, views, initial, movable, settings, face, torch.from_numpy(times)
+    )
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
     rate, size = settings.learning_rate, settings.minibatch
     fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
     identity, poses = _outcome(objective, fitted, spread)
+    identity = with_eyeballs(body, identity) if bool(seen[on_face].any()) else identity
+    eyes = _fit_eyes(body, landmarks, objective, fitted, identity)
+    if eyes is not None:
+        expression, rotation = eyes.applied(poses.expression, poses.rotation)
+        poses = dataclasses.replace(poses, expression=expression, rotation=rotation)
     error = objective.residuals(fitted)
-    seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
-    return Registration(identity, poses, observations, error, recorder.curve, seconds, registered)
+    seconds, registered = tuple(recorder.seconds), registered_faces(settings, target, start)
+    return Registration(identity, poses, observations, error, recorder.curve, seconds, registered, eyes)
 
 
-def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+def _fit_eyes(
+    body: BodyModel,
+    landmarks: Landmarks,
+    objective: RegistrationObjective,
+    fitted: Parameters,
+    identity: Identity,
+) -> FittedEyes | None:
+    """Lids and gaze of the fitted clip, where eyes were seen, with the eyeballs of its identity."""
+    settings, observations = objective.settings, objective.observations
+    shut = shut_expressions(body, landmarks.face_mesh, identity)
+    shift = torch.zeros(len(observations.group), 3)
+    for eye, joint in enumerate((LEFT_EYE, RIGHT_EYE)):
+        of_eye = (observations.points.joint < 0) & eyeball(body, eye)[observations.points.vertices].any(1)
+        shift[of_eye] = identity.joint_offset[joint]
+    model = dataclasses.replace(objective.model, rest=objective.model.rest + shift)
+    with torch.no_grad():
+        fitted = dataclasses.replace(fitted, joint_offset=identity.joint_offset)
+        matrices = torch.where(objective.movable, fitted.matrices, objective.start)
+        weights = settings.lambda_lids, settings.lambda_gaze
+        return fit_eyes(model, observations, objective.views, fitted, matrices, shut, weights)
+
+
+def registered_faces(settings: FitSettings, target: FaceTarget | None, start: InitialPoses | None) -> int:
+    """The number of frames whose face is registered: fitted first, or with the expression that was given."""
+    if target is not None:
+        return int(target.valid.sum())
+    given = start is not None and start.expression is not None and settings.face != "off"
+    return int(start.valid.sum()) if given and start is not None else 0
+
+
+def _without_outlier_frames(keypoints: Keypoints, times: np.ndarray, log: Callable[[str], None]) -> Keypoints:
     """The detections with outlier frames masked, see ``outlier_frames.py``; the log names these frames."""
-    keypoints, outliers = mask_outlier_frames(keypoints)
+    keypoints, outliers = mask_outlier_frames(keypoints, times)
     if outliers:
         log(
             f"frame {', '.join(map(str, outliers))}: left and right are exchanged, or the points are nowhere "

@@ -130,14 +130,14 @@ def joint_limit_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def velocity(values: Tensor, times: Tensor) -> Tensor:
-    """Differences of neighbouring frames, divided by the square root of the frames between them.
+    """Differences of neighbouring frames, divided by the square root of the time between them.
 
     Its square summed over a gap of dropped frames is what the same motion, spread evenly over the
-    missing frames, would have given.
+    missing frames, would have given, whatever the frame rate.
 
     Args:
         values: [T, ...].
-        times: [T], increasing, in frames.
+        times: [T], increasing, in 30ths of a second.
 
     Returns:
         [T - 1, ...]; empty for one frame.
@@ -147,11 +147,11 @@ def velocity(values: Tensor, times: Tensor) -> Tensor:
 
 
 def acceleration(values: Tensor, times: Tensor) -> Tensor:
-    """Second difference a frame squared; x[t+1] - 2 x[t] + x[t-1] where no frame is missing.
+    """Second difference a 30th of a second squared; x[t+1] - 2 x[t] + x[t-1] at that rate.
 
     Args:
         values: [T, ...].
-        times: [T], increasing, in frames.
+        times: [T], increasing, in 30ths of a second.
 
     Returns:
         [T - 2, ...]; empty for fewer than three frames.
@@ -209,3 +209,21 @@ def face_edge_loss(points: Tensor, target: Tensor, edges: Tensor) -> Tensor:
         return (places[edges[:, 0]] - places[edges[:, 1]]).norm(dim=-1)
 
     return (lengths(points) - lengths(target)).abs()
+
+
+def tie_of_two(seen: Tensor, weight: Tensor, tie: Tensor) -> Tensor:
+    """The pair c that is least in sum_e weight_e (c_e - seen_e)^2 + tie (c_0 - c_1)^2.
+
+    Args:
+        seen, weight: [T, 2], weights above 0.
+        tie: [T], how strongly both are held together.
+
+    Returns:
+        [T, 2].
+    """
+    first, second = weight.unbind(1)
+    determinant = first * second + tie * (first + second)
+    pulls = weight * seen
+    both = tie * pulls.sum(1)
+    pair = torch.stack([second * pulls[:, 0] + both, first * pulls[:, 1] + both], dim=1)
+    return pair / determinant[:, None]

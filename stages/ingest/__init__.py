@@ -28,7 +28,7 @@ def idle(settings: IngestSettings) -> dict[str, str]:
 
 STAGE = Stage(
     name="ingest",
-    version=5,
+    version=6,
     settings=IngestSettings,
     run="stages.ingest.run:run",
     assets=lambda settings: ("mediapipe",) if settings.uses_estimator else (),

@@ -21,6 +21,7 @@ from stages.ingest.mask_files import read_given_mask
 from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
 from stages.ingest.settings import IngestSettings
+from stages.ingest.stills import are_stills, detects_singly
 from stages.ingest.video import Clip, SourceFrame, missing_frames, read_clip
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class DetectedClip:
         read: how many frames were looked at.
         dropped: reason -> frames.
         people: how many people there are at once; 0 where nobody counted.
+        stills: whether the frames are single pictures, see ``stills.py``.
     """
 
     keypoints: Keypoints
@@ -55,6 +57,7 @@ class DetectedClip:
     read: int
     dropped: dict[str, int]
     people: int
+    stills: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,9 +80,14 @@ class FrameDetector:
     """Detects the chosen person in one frame after the other."""
 
     def __init__(
-        self, context: Context, clip: Clip, sources: DetectionSources, found: people.ClipPeople
+        self,
+        context: Context,
+        clip: Clip,
+        sources: DetectionSources,
+        found: people.ClipPeople,
+        singly: bool = False,
     ) -> None:
-        """Load the estimator if the sources need it."""
+        """Load the estimator if the sources need it; ``singly``: it looks at each frame by itself."""
         self.settings, self.clip, self.sources, self.people = context.settings, clip, sources, found
         self.scale = min(1.0, self.settings.long_side / max(clip.width, clip.height))
         self.width, self.height = (max(1, round(side * self.scale)) for side in (clip.width, clip.height))
@@ -89,7 +97,7 @@ class FrameDetector:
         )
         self.estimator = None
         if sources.mediapipe is not None:
-            self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG)
+            self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG, singly)
         self.agreements: list[Agreement] = []
 
     def detect_frame(self, picture: SourceFrame) -> FrameDetections | str:
@@ -202,7 +210,12 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
     settings = context.settings
     everyone, total = count_people(context, clip, sources)
     sources = with_mask_form(context, clip, sources)
-    detector = FrameDetector(context, clip, sources, everyone)
+    stills = are_stills(clip, settings)
+    singly = detects_singly(clip, settings, stills)
+    if singly and sources.mediapipe is not None:
+        kind = "pictures do not follow one another" if stills else "frames lie far apart in time"
+        context.log(f"{clip.path.name}: its {kind}: each is detected by itself")
+    detector = FrameDetector(context, clip, sources, everyone, singly)
     kept: list[tuple[int, float, FrameDetections]] = []
     dropped: Counter[str] = Counter()
     numbers: set[int] = set()
@@ -233,8 +246,17 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
         check_frames(sources, numbers)
     check_agreement(detector.agreements)
     seconds, dropped_for = tuple(seconds for _, seconds, _ in kept), dict(sorted(dropped.items()))
-    size = (detector.width, detector.height, detector.scale)
-    return DetectedClip(_stack(kept, detector), seconds, *size, len(numbers), dropped_for, everyone.count)
+    return DetectedClip(
+        keypoints=_stack(kept, detector),
+        seconds=seconds,
+        width=detector.width,
+        height=detector.height,
+        scale=detector.scale,
+        read=len(numbers),
+        dropped=dropped_for,
+        people=everyone.count,
+        stills=stills,
+    )
 
 
 def _stack(kept: list[tuple[int, float, FrameDetections]], detector: FrameDetector) -> Keypoints:

@@ -14,12 +14,13 @@ import numpy as np
 
 from pipeline.clip.camera import Camera
 from pipeline.clip.keypoints import Keypoints
+from pipeline.clip.records import SHOT_STEP
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses, on_frames
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.cameras.choose import ClipCameras, choose_cameras
 from stages.ingest.cameras.distortion import undistort_frames
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, join_poses
+from stages.ingest.datasets.recording import Recording, Shot, join_poses
 from stages.ingest.detect import DetectedClip, detect
 from stages.ingest.external_detections import open_sources
 from stages.ingest.foreground import write_foreground

@@ -8,6 +8,7 @@ from functools import cached_property
 from torch import Tensor
 
 from pipeline.avatar import Decoded, Posed
+from pipeline.avatar.identity_change import IdentityChange
 from pipeline.avatar.sparse import SparsePair
 from pipeline.clip.composite import over
 from pipeline.clip.views import View
@@ -27,10 +28,22 @@ class StaticAvatar:
     Attributes:
         decoded: the static heads' output.
         regions: of its mesh.
+        identity: what is learnt of the identity; None where nothing is.
     """
 
     decoded: Decoded
     regions: Regions
+    identity: IdentityChange | None = None
+
+    @property
+    def joint_change(self) -> Tensor | None:
+        """The change of joint offsets, see ``IdentityChange.offset_change``; None where none is learnt."""
+        return None if self.identity is None else self.identity.offset_change()
+
+    @property
+    def joint_asymmetry(self) -> Tensor | None:
+        """See ``IdentityChange.asymmetry``; None where no identity is learnt."""
+        return None if self.identity is None else self.identity.asymmetry()
 
     @property
     def neighbours(self) -> SparsePair:
@@ -56,6 +69,7 @@ class RenderedFrame(StaticAvatar):
         texture: [N, 3], the mean colour at each Gaussian; None where no term asks for it.
         network: LPIPS; None where it has no weight.
         crop_side: of the square that LPIPS is taken of, pixels; 0 for the whole picture.
+        metres: scales are compared with their neighbours in metres, not as logarithms.
     """
 
     draw: Draw
@@ -66,6 +80,7 @@ class RenderedFrame(StaticAvatar):
     texture: Tensor | None  # [N, 3]
     network: Lpips | None
     crop_side: int
+    metres: bool
 
     @cached_property
     def target(self) -> Tensor:
@@ -90,6 +105,18 @@ class RenderedFrame(StaticAvatar):
     def colors(self) -> Tensor:
         """The Gaussians' colours, [N, 3]."""
         return self.posed.gaussians.colors
+
+    @property
+    def compared_scale(self) -> Tensor:
+        """The scales that are compared with their neighbours', [N, 3]: log scales, or metres."""
+        return self.posed.gaussians.scales if self.metres else self.posed.log_scale
+
+    @property
+    def scale_change(self) -> Tensor | None:
+        """Delta S_pose, [N, 3]: what the pose adds to the log scales; None while the pose heads are off."""
+        if self.posed.pose_offset is None:
+            return None
+        return self.posed.log_scale - self.decoded.log_scale
 
     @cached_property
     def unmixed(self) -> Tensor | None:

@@ -60,6 +60,8 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     data = read_training_data(inputs["ingest"], inputs["fit"], auxiliary, context.body_file, margin)
     plan = read_plan(inputs["plan"] / "plan.json")
     settings = apply_plan(context.settings, plan)
+    if context.settings.face and not settings.face:
+        log(f"no face loss, though train.face is {context.settings.face:g}: {plan['face_loss'].why}")
     device = resolve(settings.device)
     log_computing(context, device)
     started = time.monotonic()

@@ -22,7 +22,7 @@ from stages.evaluate.methods import AVATAR, AvatarMethod, pose_gradient_animatio
 from stages.evaluate.report.terminal import show_summary
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import protocol_sentences
-from stages.evaluate.test_pose_refinement import NOT_REFINED, is_called_for, refine, refined_pose
+from stages.evaluate.test_pose_refinement import NOT_REFINED, frame_loss, is_called_for, refine, refined_pose
 from tests.made.blob import FRAMES, HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
 from tests.made.body import open_body
 from tests.made.plans import plan_of
@@ -243,6 +243,15 @@ def test_a_displaced_body_comes_back_and_the_networks_stay(painted):
     assert far > 2 and off_by(painted, animate, after) < far / 4
     assert {name: value.numpy().tobytes() for name, value in avatar.state_dict().items()} == networks
     assert all(weight.grad is None for weight in avatar.parameters())
+
+
+def test_a_further_loss_of_the_pictures_takes_part(painted):
+    animate, frame = pose_gradient_animation(painted_avatar()), painted.split.test[0]
+    losses = [
+        frame_loss(painted, animate, "black", frame, perceptual)(painted.pose(frame))
+        for perceptual in (None, lambda image, truth: 0.2 * (image - 1).abs().mean())
+    ]
+    assert float(losses[1].detach()) > float(losses[0].detach()) + 0.1
 
 
 def test_a_perfect_pose_is_left_alone(painted):

@@ -108,8 +108,8 @@ FAULTS = {  # (layout, file that must be named) -> what is done to the folder
     ("xhumans", "cameras.npz"): lambda f: np.savez(
         f / "render" / "cameras.npz", intrinsic=np.eye(3), extrinsic=np.zeros((3, 3))
     ),
-    ("xhumans", "mesh-f000003_smplx.pkl"): lambda f: spoil_pickle(
-        f / "SMPLX" / "mesh-f000003_smplx.pkl", lambda v: v.pop("transl")
+    ("xhumans", "mesh-f00003_smplx.pkl"): lambda f: spoil_pickle(
+        f / "SMPLX" / "mesh-f00003_smplx.pkl", lambda v: v.pop("transl")
     ),
     ("persona", "frame_idx_list.txt"): lambda f: put(f / "captured", "frame_idx_list.txt", "1e9\n"),
     ("pose2sim", "Calib.toml"): lambda f: put(f / "calibration", "Calib.toml", "[cam_01]\nmatrix = 3\n"),

@@ -195,7 +195,7 @@ def test_lpips_begins_when_it_is_told_to(objective):
 
 def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject, tmp_path):
     whole = scene(subject, tmp_path / "whole", gate=False).objective
-    optional = {"hand_normal", "scale_size", "scale_growth", "hand_color", "arm_color"}
+    optional = {"hand_normal", "scale_size", "pose_scale", "scale_growth", "hand_color", "arm_color"}
     none = whole(scale_growth=0.0)(0, 0, False)
     every = whole(**dict.fromkeys(optional, 1.0))(0, 0, False)
     assert not optional & set(none) and optional <= set(every)

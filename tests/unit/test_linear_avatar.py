@@ -17,9 +17,7 @@ from pipeline.body import joint_transforms
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.viewer.packed import ViewedMotion, pack
-from pipeline.viewer.shown import expression_sliders, novel_motion
-from tests.made.body import BODY_FILE
-from tests.made.fake_body import official_arrays
+from pipeline.viewer.shown import novel_motion
 from tests.unit.test_avatar_representations import FRAMES, KINDS, a_pose, an_avatar
 
 SCRIPT = REPOSITORY / "pipeline" / "viewer" / "page" / "posing.js"
@@ -122,9 +120,7 @@ def test_correctives_of_the_body_are_told_by_bases_too(body):
     transforms = joint_transforms(pose.rotation[None], linear.joints, linear.parents)[0]
     placed, _ = baked.skinning_tables.place(transforms, linear.points, pose.transl)
     assert (linear.points - baked.constants.points).abs().max() > 1e-3
-    assert torch.allclose(
-        placed, baked.gaussians(pose).means, atol=1e-4
-    )  # stored in bfloat16
+    assert torch.allclose(placed, baked.gaussians(pose).means, atol=1e-4)  # stored in bfloat16
 
 
 def test_equal_avatars_give_equal_bytes_and_a_motion_of_one_frame_is_kept(body):
@@ -148,15 +144,3 @@ def test_an_avatar_of_which_the_gate_left_nothing_is_refused(body):
     avatar.active.fill_(False)
     with pytest.raises(UserError, match="train"):
         linear_avatar(avatar)
-
-
-def test_expressions_have_their_names_and_either_side_its_own(body, tmp_path):
-    count = body.expression_directions.shape[2]
-    found = expression_sliders(BODY_FILE, count)
-    both, left = (
-        np.array(found["mouthSmileLeft"]) + found["mouthSmileRight"],
-        np.array(found["mouthSmileLeft"]),
-    )
-    assert np.count_nonzero(both) == 1 and both.max() == 3.0 and np.count_nonzero(left) == 2
-    np.savez(tmp_path / "other.npz", **official_arrays())
-    assert len(expression_sliders(tmp_path / "other.npz", 50)) == 10

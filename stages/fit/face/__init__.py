@@ -12,7 +12,7 @@ import torch
 
 from pipeline.body import BodyModel, Landmarks
 from pipeline.clip.frame_files import ClipFrames
-from pipeline.clip.keypoints import Keypoints
+from pipeline.clip.keypoints import FACE, Keypoints
 from pipeline.numba_kernels import threads
 from stages.fit.camera_batch import CameraBatch
 from stages.fit.face.deca import read_flame_parameters
@@ -24,7 +24,7 @@ from stages.fit.settings import FitSettings
 
 __all__ = ["FaceTarget", "fit_face", "sface"]
 
-_MESH_POINTS = 478
+_MESH_POINTS, _FACE_POINTS = 478, 68
 
 
 def fit_face(
@@ -41,10 +41,9 @@ def fit_face(
 
     Args:
         landmarks: where the face mesh lies on it.
-        keypoints: the clip's detections; their face mesh is read.
+        keypoints: the clip's detections; their face mesh is read, or without one the 68 face points.
         observations: made of the same keypoints; says which face points to trust.
-        settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh`` where the
-            estimator gave a face mesh.
+        settings: ``face``, ``face_init`` and ``flame_model`` are read; ``auto`` is ``mesh``.
         log: told in a line each what was fitted, or why nothing was, and how files were matched.
         source: all frames of the footage, which names of files mean; None: their numbers are frame numbers.
 
@@ -58,7 +57,8 @@ def fit_face(
         log("face first: switched off")
         return None
     with threads(1), torch.no_grad():
-        model = face_model(body, landmarks.face_mesh)
+        flat = settings.face != "flame" and int(observations.of("face").sum()) == _FACE_POINTS
+        model = face_model(body, landmarks.whole_body[FACE] if flat else landmarks.face_mesh)
         if settings.face == "flame":
             folder, first = Path(settings.face_init), settings.first_number
             parameters = read_flame_parameters(folder, keypoints.frames, source, first, log)
@@ -66,7 +66,7 @@ def fit_face(
 
             target = face_from_flame(model, body, load_flame(Path(settings.flame_model)), parameters)
         else:
-            target = _from_mesh(model, keypoints, observations, views)
+            target = _from_keypoints(model, keypoints, observations, views)
     if target is None:
         log(f"face first: {_why_not(settings, observations)}")
         return None
@@ -79,19 +79,18 @@ def fit_face(
     return target
 
 
-def _from_mesh(
+def _from_keypoints(
     model: FaceModel, keypoints: Keypoints, observations: Observations, views: CameraBatch
 ) -> FaceTarget | None:
     mask = observations.mask[:, observations.of("face")]
-    if mask.shape[1] != _MESH_POINTS or not mask.any():
+    if not mask.any():
         return None
-    mesh = torch.from_numpy(keypoints.face_mesh[..., :3])[:, model.rows]
-    return face_from_mesh(model, mesh, mask[:, model.rows], views)
+    deep = mask.shape[1] == _MESH_POINTS
+    points = keypoints.face_mesh[..., :3] if deep else keypoints.whole_body[:, FACE, :2]
+    return face_from_mesh(model, torch.from_numpy(points)[:, model.rows], mask[:, model.rows], views)
 
 
 def _why_not(settings: FitSettings, observations: Observations) -> str:
     if settings.face == "flame":
         return "left out, for DECA found no face in any frame"
-    if int(observations.of("face").sum()) != _MESH_POINTS:
-        return "left out, for the keypoints hold no face mesh"
     return "left out, for no frame shows enough of a face"

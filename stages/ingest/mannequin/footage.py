@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.body import BodyModel, Landmarks, load_body, load_landmarks, rest_joints
+from pipeline.body.eyes import shut_expressions
 from pipeline.clip.camera import Camera, project
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints, write_keypoints
@@ -66,9 +67,8 @@ class Filming:
         appearance = make_appearance(body, landmarks, spec.identity)
         worn = surface_offset(body, appearance.measures, appearance.style)
         clothed = dataclasses.replace(identity, face_offset=identity.face_offset + worn)
-        motion = make_motion(
-            spec, rest_joints(body, identity), body.parents, body.expression_directions.shape[2]
-        )
+        shut_eyes = shut_expressions(body, landmarks.face_mesh, identity).sum(0)
+        motion = make_motion(spec, rest_joints(body, identity), body.parents, shut_eyes)
         shot = frame_motion(spec, body, clothed, motion)
         self.identity, self.notes = identity, motion.notes
         self.scene = make_scene(body, clothed, appearance, shot, spec.seed)

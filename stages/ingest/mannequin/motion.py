@@ -20,6 +20,10 @@ from stages.ingest.mannequin.spec import MannequinSpec
 ARMS_DOWN = 1.12
 """Radians from the T pose to arms that hang beside the body without touching it."""
 
+_CLOSING, _SHUT, _OPENING = 0.08, 0.08, 0.14  # seconds of a blink
+_BETWEEN_BLINKS, _LOOKS_FOR = (0.3, 0.9), (0.2, 0.7)  # seconds; oftener than in life, so that clips are short
+_GAZE = np.array([0.22, 0.42])  # radians up or down and aside, at most
+
 _SIDES = (("left", 1.0), ("right", -1.0))
 
 
@@ -52,6 +56,7 @@ class _Draft:
     turns: np.ndarray  # [T, 55, 3]
     expression: np.ndarray  # [T, E]
     rng: np.random.Generator
+    shut_eyes: np.ndarray  # [E]
 
     def add(self, joint: str, axis: int, angle: np.ndarray | float) -> None:
         self.turns[:, joint_index(joint), axis] += angle
@@ -69,14 +74,14 @@ class _Draft:
 
 
 def make_motion(
-    spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], expressions: int
+    spec: MannequinSpec, joints: Tensor, parents: tuple[int, ...], shut_eyes: Tensor
 ) -> MannequinMotion:
     """The motion that a spec names.
 
     Args:
         spec: motion, frames, fps and seed are read.
         joints, parents: the body's rest joints [55, 3] and its kinematic tree.
-        expressions: E, the number of the body's expression parameters.
+        shut_eyes: [E], the expression that shuts the body's eyes; zero where none does.
 
     Raises:
         UserError: the BVH file is missing or cannot be used.
@@ -84,8 +89,9 @@ def make_motion(
     draft = _Draft(
         np.arange(spec.frames) / spec.fps,
         np.zeros((spec.frames, len(JOINT_NAMES), 3)),
-        np.zeros((spec.frames, expressions)),
+        np.zeros((spec.frames, len(shut_eyes))),
         np.random.default_rng([spec.seed, 1]),
+        shut_eyes.numpy(),
     )
     for name in spec.layers:
         # Every layer has its own draws, so that adding one leaves the others as they were.
@@ -193,6 +199,27 @@ def _speech(draft: _Draft) -> None:
         draft.expression[:, unit] += draft.bursts(height, 0.3, 1.6, 0.25)
 
 
+def _eyes(draft: _Draft) -> None:
+    """Blinks, and looks from one place to the next: jumps of both eyes, as eyes move."""
+    seconds, rng = draft.seconds, draft.rng
+    lids, gaze = np.zeros(len(seconds)), np.zeros((len(seconds), 2))
+    at = rng.uniform(0.1, 0.5)
+    while at < seconds[-1]:
+        shut = at + _CLOSING + rng.uniform(0, _SHUT)
+        course = np.interp(seconds, [at, at + _CLOSING, shut, shut + _OPENING], [0.0, 1.0, 1.0, 0.0])
+        lids = np.maximum(lids, course)
+        at = shut + _OPENING + rng.uniform(*_BETWEEN_BLINKS)
+    at = 0.0
+    while at < seconds[-1]:
+        target = rng.uniform(-1, 1, 2) * _GAZE
+        gaze[seconds >= at] = target
+        at += rng.uniform(*_LOOKS_FOR)
+    draft.expression += lids[:, None] * draft.shut_eyes
+    for side, _ in _SIDES:
+        draft.add(f"{side}_eye", 0, gaze[:, 0])
+        draft.add(f"{side}_eye", 1, gaze[:, 1])
+
+
 _LAYERS: dict[str, Callable[[_Draft], None]] = {
     "stand": lambda draft: None,
     "turn": _turn,
@@ -201,4 +228,5 @@ _LAYERS: dict[str, Callable[[_Draft], None]] = {
     "curl": _curl,
     "speech": _speech,
     "nod": _nod,
+    "eyes": _eyes,
 }

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body import BodyModel, Identity, is_face, joint_index
+from pipeline.body.eyes import with_eyeballs
 
 BETA, BETA_LIMIT = 0.8, 1.8
 JOINT_OFFSET = 0.006  # metres, standard deviation in each direction
@@ -29,8 +30,11 @@ def make_identity(body: BodyModel, seed: int) -> Identity:
         offset = rng.normal(0, JOINT_OFFSET, 3)
         joint_offset[joint_index(f"left_{part}")] = offset
         joint_offset[joint_index(f"right_{part}")] = offset * [-1, 1, 1]
-    return Identity(
-        torch.from_numpy(betas).float(), torch.from_numpy(joint_offset).float(), _face_offset(body, rng)
+    return with_eyeballs(
+        body,
+        Identity(
+            torch.from_numpy(betas).float(), torch.from_numpy(joint_offset).float(), _face_offset(body, rng)
+        ),
     )
 
 

@@ -19,7 +19,7 @@ Noise = Annotated[float, Field(ge=0, le=100)]
 
 FRAMINGS: tuple[Framing, ...] = get_args(Framing)
 DETECTORS: tuple[Detector, ...] = get_args(Detector)
-LAYERS = ("stand", "turn", "sway", "gesture", "curl", "speech", "nod")
+LAYERS = ("stand", "turn", "sway", "gesture", "curl", "speech", "nod", "eyes")
 VIEWS: Mapping[UnseenView, tuple[float, float]] = {
     "left": (60.0, 0.0), "right": (-60.0, 0.0), "back": (180.0, 0.0), "above": (25.0, 40.0),
 }  # fmt: skip
