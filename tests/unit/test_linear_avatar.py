@@ -17,9 +17,7 @@ from pipeline.body import joint_transforms
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.viewer.packed import ViewedMotion, pack
-from pipeline.viewer.shown import expression_sliders, novel_motion
-from tests.made.body import BODY_FILE
-from tests.made.fake_body import official_arrays
+from pipeline.viewer.shown import novel_motion
 from tests.unit.test_avatar_representations import FRAMES, KINDS, a_pose, an_avatar
 
 SCRIPT = REPOSITORY / "pipeline" / "viewer" / "page" / "posing.js"
@@ -146,15 +144,3 @@ def test_an_avatar_of_which_the_gate_left_nothing_is_refused(body):
     avatar.active.fill_(False)
     with pytest.raises(UserError, match="train"):
         linear_avatar(avatar)
-
-
-def test_expressions_have_their_names_and_either_side_its_own(body, tmp_path):
-    count = body.expression_directions.shape[2]
-    found = expression_sliders(BODY_FILE, count)
-    both, left = (
-        np.array(found["mouthSmileLeft"]) + found["mouthSmileRight"],
-        np.array(found["mouthSmileLeft"]),
-    )
-    assert np.count_nonzero(both) == 1 and both.max() == 3.0 and np.count_nonzero(left) == 2
-    np.savez(tmp_path / "other.npz", **official_arrays())
-    assert len(expression_sliders(tmp_path / "other.npz", 50)) == 10
