@@ -64,6 +64,7 @@ const Viewer = (() => {
     // Takes an avatar in place of the one before; sliders and camera stay as they are.
     take(avatar) {
       const first = !this.avatar;
+      this.renderer.takeOpacities(avatar.opacities);
       this.avatar = avatar;
       this.index = Object.fromEntries(avatar.joint_names.map((name, j) => [name, j]));
       this.shown = new Uint8Array(avatar.count).fill(1);
@@ -291,7 +292,7 @@ const Viewer = (() => {
     }
 
     draw(camera) {
-      this.renderer.draw(camera, this.avatar.opacity, this.shown, GREY);
+      this.renderer.draw(camera, this.shown, GREY);
     }
 
     count(now) {

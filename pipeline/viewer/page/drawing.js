@@ -10,16 +10,17 @@ const Drawing = (() => {
     precision highp int;
     precision highp sampler2D;
     uniform sampler2D gaussians;
+    uniform sampler2D opacities;
     uniform mat3 rotation;     // world to camera
     uniform vec3 translation;
     uniform vec4 lens;         // fx, fy, cx, cy, pixels
     uniform vec2 size;         // of the image, pixels
-    uniform float opacity;
     in vec2 corner;
     in uint which;
     out vec2 offset;           // from the mean, pixels
     flat out vec3 conic;
     flat out vec3 color;
+    flat out float opacity;
     vec4 texel(uint k) {
       uint at = 3u * which + k;
       return texelFetch(gaussians, ivec2(at % ${WIDTH}u, at / ${WIDTH}u), 0);
@@ -39,10 +40,11 @@ const Drawing = (() => {
       float determinant = max(xx * yy - xy * xy, 1e-6);
       conic = vec3(0.5 * yy, -xy, 0.5 * xx) / determinant;
       color = c.yzw;
+      opacity = texelFetch(opacities, ivec2(which % ${WIDTH}u, which / ${WIDTH}u), 0).r;
       float middle = 0.5 * (xx + yy), half_ = sqrt(max(middle * middle - determinant, 0.0));
       float long_ = middle + half_, short_ = max(middle - half_, 0.0);
       vec2 axis = abs(xy) > 1e-6 ? normalize(vec2(xy, long_ - xx)) : (xx >= yy ? vec2(1, 0) : vec2(0, 1));
-      float reach = sqrt(2.0 * log(255.0 * opacity));
+      float reach = sqrt(2.0 * log(max(255.0 * opacity, 1.0)));
       offset = reach * (corner.x * sqrt(long_) * axis + corner.y * sqrt(short_) * vec2(-axis.y, axis.x));
       vec2 pixel = lens.xy * p.xy / p.z + lens.zw + offset;
       gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
@@ -50,10 +52,10 @@ const Drawing = (() => {
 
   const FRAGMENT = `#version 300 es
     precision highp float;
-    uniform float opacity;
     in vec2 offset;
     flat in vec3 conic;
     flat in vec3 color;
+    flat in float opacity;
     out vec4 found;
     void main() {
       float sigma = conic.x * offset.x * offset.x + conic.y * offset.x * offset.y + conic.z * offset.y * offset.y;
@@ -115,10 +117,11 @@ const Drawing = (() => {
       this.gl = gl;
       this.program = compiled(gl);
       this.uniforms = {};
-      for (const name of ["gaussians", "rotation", "translation", "lens", "size", "opacity"]) {
+      for (const name of ["gaussians", "rotation", "translation", "lens", "size", "opacities"]) {
         this.uniforms[name] = gl.getUniformLocation(this.program, name);
       }
       this.texture = gl.createTexture();
+      this.opacities = gl.createTexture();
       this.order = gl.createBuffer();
       this.numbers = new Uint32Array(0);
       this.rows = 0;
@@ -134,6 +137,15 @@ const Drawing = (() => {
       if (kind === gl.FLOAT) gl.vertexAttribPointer(at, width, kind, false, 0, 0);
       else gl.vertexAttribIPointer(at, width, kind, 0, 0);
       gl.vertexAttribDivisor(at, divisor);
+    }
+
+    // Takes the opacity of each Gaussian, which no pose changes.
+    takeOpacities(values) {
+      const gl = this.gl, rows = Math.ceil(values.length / WIDTH), room = new Float32Array(WIDTH * rows);
+      room.set(values);
+      gl.bindTexture(gl.TEXTURE_2D, this.opacities);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32F, WIDTH, rows, 0, gl.RED, gl.FLOAT, room);
+      for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     }
 
     // Takes the Gaussians of a pose, 12 floats each.
@@ -158,20 +170,22 @@ const Drawing = (() => {
     // Draws what was taken.
     //   camera: fx, fy, cx, cy, width, height (pixels of the canvas), rotation by rows, translation.
     //   shown: 1 for each Gaussian to draw; background: RGB in [0, 1].
-    draw(camera, opacity, shown, background) {
+    draw(camera, shown, background) {
       const gl = this.gl, [fx, fy, cx, cy, width, height, ...placed] = camera;
       const left = sorted(this.data, this.count, shown, camera, this.numbers);
       gl.viewport(0, 0, width, height);
       gl.clearColor(...background, 1);
       gl.clear(gl.COLOR_BUFFER_BIT);
       gl.useProgram(this.program);
-      gl.bindTexture(gl.TEXTURE_2D, this.texture);
-      gl.uniform1i(this.uniforms.gaussians, 0);
+      for (const [unit, name, texture] of [[1, "opacities", this.opacities], [0, "gaussians", this.texture]]) {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(gl.TEXTURE_2D, texture);
+        gl.uniform1i(this.uniforms[name], unit);
+      }
       gl.uniformMatrix3fv(this.uniforms.rotation, true, placed.slice(0, 9));
       gl.uniform3f(this.uniforms.translation, ...placed.slice(9));
       gl.uniform4f(this.uniforms.lens, fx, fy, cx, cy);
       gl.uniform2f(this.uniforms.size, width, height);
-      gl.uniform1f(this.uniforms.opacity, opacity);
       gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
       gl.bufferData(gl.ARRAY_BUFFER, this.numbers.subarray(0, left), gl.DYNAMIC_DRAW);
       gl.disable(gl.DEPTH_TEST);

@@ -67,7 +67,7 @@ const Posing = (() => {
       expressionMoves: arrays.expression_moves, // [3 E, M]: point by point, row c E + e
       expressive: arrays.expressive.length, expressionCount: header.expression_count,
       signal: { mean: arrays.signal_mean, components: arrays.signal_components, limits: arrays.signal_limits },
-      trust: arrays.trust, parts: arrays.parts,
+      trust: arrays.trust, parts: arrays.parts, opacities: arrays.opacities,
     };
   }
 
