@@ -171,7 +171,7 @@ def _add_avatar(arrays: _Arrays, avatar: LinearAvatar) -> None:
     arrays.floats("signal_limits", avatar.signal.limits.numpy())
     arrays.floats("joints", avatar.joints.numpy())
     arrays.ranged("trust", avatar.trust[:, None].numpy(), 8)
-    arrays.ranged("opacities", avatar.opacities[:, None].numpy(), 8)
+    arrays.ranged("opacities", avatar.opacities[:, None].numpy(), 16)
     arrays.bytes_("parts", avatar.parts.numpy())
 
 

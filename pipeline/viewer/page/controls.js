@@ -64,7 +64,6 @@ const Viewer = (() => {
     // Takes an avatar in place of the one before; sliders and camera stay as they are.
     take(avatar) {
       const first = !this.avatar;
-      this.renderer.takeOpacities(avatar.opacities);
       this.avatar = avatar;
       this.index = Object.fromEntries(avatar.joint_names.map((name, j) => [name, j]));
       this.shown = new Uint8Array(avatar.count).fill(1);
@@ -215,7 +214,7 @@ const Viewer = (() => {
       this.repose();
       const basis = this.basis(), data = this.data, step = Math.max(1, this.avatar.count / 4000 | 0);
       for (let i = 0; i < this.avatar.count; i += step) {
-        const place = Posing.times(basis, data[12 * i], data[12 * i + 1], data[12 * i + 2]);
+        const place = Posing.times(basis, data[Posing.TEXEL * i], data[Posing.TEXEL * i + 1], data[Posing.TEXEL * i + 2]);
         for (let c = 0; c < 3; c++) lists[c].push(place[c]);
       }
     }
@@ -258,7 +257,7 @@ const Viewer = (() => {
     recolour() {
       const { count, trust, parts } = this.avatar, data = this.data;
       for (let i = 0; i < count; i++) {
-        const to = 12 * i + 9;
+        const to = Posing.TEXEL * i + 9;
         if (this.colouring === "parts") data.set(this.parts[parts[i]], to);
         else for (let c = 0; c < 3; c++) data[to + c] = trust[i] * data[to + c] + (1 - trust[i]) * GUESSED[c];
       }
