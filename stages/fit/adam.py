@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from pipeline.clip.clock import usual_step
 from pipeline.clip.curves import Curve
 from pipeline.finite import NotFiniteError, finite, rows_not_finite
 from pipeline.numba_kernels import threads
@@ -41,7 +40,7 @@ _POINTS = 16  # of the curve
 REMEDY = "look at the keypoints and cameras, or try a smaller fit.learning_rate; nothing is published"
 _NAMED = 5  # frames that a message names
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
-"""From which share of the iterations on steps have which width: 30ths of a second, frames if shorter."""
+"""From which share of the iterations on steps have which width in time: in 30ths of a second."""
 
 
 StepCallback = Callable[[int, float, Callable[[], Parameters]], None]
@@ -185,7 +184,7 @@ def optimise(
         [{"params": [leaf], "name": name} for name, leaf in steps.named().items()], betas=(0.9, 0.99)
     )
     with threads(1):
-        for begin, end, width in _phases(iterations, usual_step(objective.times.numpy())):
+        for begin, end, width in _phases(iterations):
             for step in range(begin, end):
                 for group in adam.param_groups:
                     share = rate(group["name"], step / iterations, frozen)
@@ -211,17 +210,10 @@ def _moved(base: Parameters, steps: Parameters, times: Tensor, width: float, siz
     return dataclasses.replace(parts[0], **joined).orthonormal()
 
 
-def _phases(iterations: int, step: float = 1.0) -> list[tuple[int, int, float]]:
-    """First step, last step + 1 and width of each phase that has a step.
-
-    Frames that follow one another faster than 30 a second move together in the same number, not for as long:
-    how many frames a step moves decides how well it goes, and quick movements are quick.
-
-    Args:
-        step: the usual time from frame to frame.
-    """
+def _phases(iterations: int) -> list[tuple[int, int, float]]:
+    """First step, last step + 1 and width of each phase that has a step."""
     starts = [round(share * iterations) for share, _ in BUMPS] + [iterations]
-    phases = [(starts[k], starts[k + 1], width * min(1.0, step)) for k, (_, width) in enumerate(BUMPS)]
+    phases = [(starts[k], starts[k + 1], width) for k, (_, width) in enumerate(BUMPS)]
     return [phase for phase in phases if phase[0] < phase[1]]
 
 
