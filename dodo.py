@@ -10,6 +10,7 @@
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
     doit run animate subject=oliver motion=dance.bvh    the avatar in a motion that nobody filmed
+    doit run view subject=smile                 the avatar in a browser, also while it trains
     doit run ablate subject=smile               what each part of the method is worth
     doit run tradeoff subject=smile budget=20m  what accuracy costs in time
 
@@ -36,7 +37,7 @@ from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
-from pipeline.run.effect import check_effect, named_tasks, running
+from pipeline.run.effect import VIEW, check_effect, named_tasks, running
 from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
 from pipeline.run.stage import load_stages, usual
 from pipeline.run.stage_runner import StageRunner
@@ -44,7 +45,7 @@ from pipeline.store.artifact import Store
 from pipeline.store.verify import verify
 
 DEFAULT_SUBJECT = "smile"
-CARE = ("verify", "prune")  # tasks about stored results
+CARE = ("verify", "prune", VIEW)  # tasks about stored results
 
 
 def chosen_subjects(request: Request) -> tuple[str, ...]:
@@ -282,6 +283,28 @@ def task_prune():
             "doc": f"keep only {subject}'s latest versions",
             "actions": [(prune_subject, [subject])],
         }
+
+
+def view_subject() -> TaskFailed | None:
+    """Shows the chosen subject's avatar until it is told to stop."""
+    from pipeline.viewer.view import view
+
+    if len(CHOSEN) > 1:
+        return TaskFailed("view shows one subject: name one, subject=NAME")
+    try:
+        view(CHOSEN[0], REQUEST)
+    except (UserError, OSError) as error:
+        return TaskFailed(str(error))
+    return None
+
+
+def task_view():
+    """The avatar in a browser, to be turned and moved: subject=, motion=, port=, host=."""
+    moved = "animate.motion" in REQUEST.overrides
+    return {
+        "actions": [(view_subject, [])],
+        "task_dep": [f"animate:{subject}" for subject in CHOSEN] if moved else [],
+    }
 
 
 def run_studies(studies: Iterable[Callable[[Request], object]]) -> TaskFailed | None:

@@ -21,6 +21,7 @@ setup(
             *(f"data/{folder}/*.toml" for folder in ("presets", "subjects", "datasets")),
             *("data/assets.toml", "data/body/*.npz", "data/body/*.md"),
         ],
+        f"{INNER}.pipeline.viewer.page": ["*.jinja", "*.js"],
         f"{INNER}.pipeline.studies": ["*.toml", "*.jinja"],
         f"{INNER}.stages.evaluate.report": ["*.jinja", "*.js"],
     },

@@ -16,9 +16,9 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from pipeline.avatar import Avatar, Decoded, Posed, pose_features
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE
 from pipeline.avatar.canonical import HEAD
 from pipeline.avatar.head import GroupNormReLU, Head
+from pipeline.avatar.posed import LARGEST_SCALE, LOG_SCALE_RANGE
 from pipeline.avatar.triplane import PLANES, Triplane, normalise
 from pipeline.body import Pose, joint_transforms, linear_blend_skinning, vertex_normals
 from pipeline.splat import Gaussians

@@ -10,18 +10,14 @@ Results, fetched assets and a user's own subjects and presets lie in ``./data``,
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-_HERE = Path(__file__).resolve().parent
-ROOT = _HERE / "checkout" if (_HERE / "checkout").is_dir() else _HERE.parent
-"""The folder with dodo.py, ``pipeline``, ``stages`` and ``data``: in a wheel a part of this package, so that
-nothing of such common names lies in an environment's own folder."""
+from flexiavatar import ROOT, use_checkout
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns the exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    sys.path.insert(0, str(ROOT))
+    use_checkout()
     if not words or words[0] in ("-h", "--help", "help"):
         print((__doc__ or "").strip())
         return 0

@@ -131,25 +131,54 @@ def orbit(extent: Extent, width: int, height: int, count: int, turns: float = 1.
         count: of cameras.
         turns: how often they go round.
     """
+    return [view(extent, width, height, turns * place / count) for place in range(count)]
+
+
+def view(extent: Extent, width: int, height: int, turn: float = 0.0, pitch: float = 0.0) -> Camera:
+    """A camera that looks at a body from as near as it can without cutting anything off at any turn.
+
+    Args:
+        extent: what is filmed.
+        width: pixels.
+        height: pixels.
+        turn: where it stands on the circle, 0 to 1: before the face (+Z), then to the body's left.
+        pitch: how far above the level it stands, radians, -pi / 2 to pi / 2.
+    """
     focal = height / 2 / math.tan(_FIELD / 2)
     across, up = (focal / (_FILL * side / 2) for side in (width, height))
+    sine, cosine = abs(math.sin(pitch)), abs(math.cos(pitch))
+    tall, deep = (
+        extent.height * cosine + extent.radius * sine,
+        extent.radius * cosine + extent.height * sine,
+    )
     # A point on the radius r at height y is in view from the distance d at every angle a if
     # y up <= d - r cos(a) and r sin(a) across <= d - r cos(a).
-    needed = np.maximum(extent.height * up + extent.radius, extent.radius * math.hypot(across, 1))
+    needed = np.maximum(tall * up + deep, np.hypot(extent.radius * across, deep))
     # The camera must not stand inside a body of no size.
     distance = max(float(np.quantile(needed, 1 - _OUTLIERS)), _NEAREST)
-    size, places = (width, height), [turns * place / count for place in range(count)]
-    return [_orbit_camera(extent.centre, distance, focal, size, place) for place in places]
+    return _orbit_camera(extent.centre, distance, focal, (width, height), turn, pitch)
 
 
 def _orbit_camera(
-    centre: Tensor, distance: float, focal: float, size: tuple[int, int], turn: float
+    centre: Tensor,
+    distance: float,
+    focal: float,
+    size: tuple[int, int],
+    turn: float,
+    pitch: float = 0.0,
 ) -> Camera:
-    """The camera at ``turn`` (0 to 1) of the circle, looking level at the centre."""
+    """The camera at ``turn`` (0 to 1) of the circle and ``pitch`` above it, looking at the centre."""
     width, height = size
     sine, cosine = math.sin(2 * math.pi * turn), math.cos(2 * math.pi * turn)
+    high, level = math.sin(pitch), math.cos(pitch)
     # Rows: the camera's right, down and forward in the world.
-    rotation = torch.tensor([[cosine, 0.0, -sine], [0.0, -1.0, 0.0], [-sine, 0.0, -cosine]])
-    place = centre + distance * torch.tensor([sine, 0.0, cosine])
+    rotation = torch.tensor(
+        [
+            [cosine, 0.0, -sine],
+            [sine * high, -level, cosine * high],
+            [-sine * level, -high, -cosine * level],
+        ]
+    )
+    place = centre + distance * torch.tensor([sine * level, high, cosine * level])
     intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera(width, height, intrinsics, rotation, -rotation @ place)

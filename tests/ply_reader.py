@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from pipeline.splat import Gaussians
-from pipeline.splat.ply import SH_0
+from pipeline.splat.stored_splats import SH_0
 
 
 def read_ply(path):

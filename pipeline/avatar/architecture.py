@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+ON_REQUEST = ("residual_moves", "plane_pose", "learn_identity", "learn_opacity", "correctives")
+"""Sizes that a file holds only where they are not the default."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
@@ -12,6 +15,7 @@ class Architecture:
     Attributes:
         plane_resolution: texels along a side of each plane.
         plane_channels: features a texel; three planes give ``f_i`` three times as many.
+        plane_deviation: standard deviation of the first features; a file does not hold it.
         width: hidden channels of the heads.
         groups: of GroupNorm in the heads.
         subdivisions: levels of midpoint subdivision of the body mesh.
@@ -27,6 +31,11 @@ class Architecture:
         pose_heads: whether there are any; one who never moves needs none.
         representation: ``"triplane"`` or ``"bases"``; the sizes of planes and heads are the triplane's.
         bases: K, of the bases.
+        plane_pose: whose rest mesh tells the triplane's coordinates: ``"own"``, the identity's in T pose, or
+            ``"open"``, the mean identity's with legs apart and the mouth open (see ``open_positions``).
+        learn_identity: betas and joint offsets change in training (see ``identity_change.py``).
+        learn_opacity: each Gaussian has an opacity of its own, which starts at ``opacity``.
+        correctives: where the body's pose correctives act: ``"all"``, or ``"face_and_hands"``.
     """
 
     plane_resolution: int = 128
@@ -48,3 +57,8 @@ class Architecture:
     residual_moves: bool = False
     representation: str = "triplane"
     bases: int = 0
+    plane_deviation: float = 0.01
+    plane_pose: str = "own"
+    learn_identity: bool = False
+    learn_opacity: bool = False
+    correctives: str = "all"

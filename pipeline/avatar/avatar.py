@@ -16,20 +16,26 @@ from torch import Tensor, nn
 
 from pipeline.avatar.architecture import Architecture
 from pipeline.avatar.bases_representation import BasesRepresentation
-from pipeline.avatar.canonical import Canonical, build_canonical
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
-from pipeline.avatar.posed import Posed, pose_features, rest_shape
+from pipeline.avatar.identity_change import IdentityChange
+from pipeline.avatar.levels import build_surfaces, finest_level
+from pipeline.avatar.posed import (
+    LARGEST_SCALE,
+    LOG_SCALE_RANGE,
+    Posed,
+    initial_scales,
+    pose_features,
+    rest_shape,
+    scaled_residual,
+    scales_of,
+)
 from pipeline.avatar.representation import Condition, Decoded, LinearChange, Representation
-from pipeline.avatar.residual import regions
 from pipeline.avatar.skinning_tables import OWN, SkinningTables, nearest_rows, with_weights_of
-from pipeline.avatar.surface import Surface, active_rows, build_surface, plane_regions, restricted
+from pipeline.avatar.surface import Surface, active_rows, restricted
 from pipeline.avatar.triplane_representation import TriplaneRepresentation
 from pipeline.body import BodyModel, Identity, Pose, blend_transforms, joint_transforms, transform_points
 from pipeline.device import kernels_serve, moved
 from pipeline.splat import Gaussians
-
-LOG_SCALE_RANGE = (-2.0, 1.2)  # a Gaussian stays within 0.14 to 3.3 times its initial size
-LARGEST_SCALE = 0.03  # metres
 
 
 class Avatar(nn.Module):
@@ -47,8 +53,11 @@ class Avatar(nn.Module):
         unseen: what a finished avatar shows where it was gated, ``"nothing"`` or ``"base"``.
         pose_heads_active: whether what follows the pose takes part: pose heads or bases.
         residuals_active: whether the residual colour heads take part.
+        residual_share: the share of their colours that is added; less than 1 while they come in.
         at_once: posed in one pass over the Gaussians where that can be (``fused_posing.py``), else step by
             step, which gives the same.
+        identity_change: of betas and joint offsets; None where they are not learnt.
+        opacity_logit: [N, 1], of the finest level; None where opacities are not learnt.
         base_color: [N, 3] logits on the finest level; what learnt colours are added to.
         skin_rows: [N] int64, the body vertex whose skinning weights each takes, see ``nearest_rows``.
         trust: [N, 2] in [0, 1], how far evidence bears out what was learnt of colour and of shape, see
@@ -92,23 +101,19 @@ class Avatar(nn.Module):
         self.architecture, self.vertex_ids, self.identity = architecture, vertex_ids, identity
         self.body_digest, self.half_precision = body.digest, half_precision
         self.pose_heads_active, self.residuals_active = architecture.pose_heads, True
-        self.at_once = True
+        self.residual_share, self.at_once = 1.0, True
         self.splits = tuple(splits)
-        if self.splits:
-            meshes = [build_canonical(body, identity, 0, vertex_ids, rounds) for rounds in ((), self.splits)]
-        else:
-            levels = range(architecture.subdivisions + 1)
-            meshes = [build_canonical(body, identity, level, vertex_ids) for level in levels]
-        planes, self.boxes = plane_regions(meshes[-1])
-        residual = regions(meshes, architecture.residual_parts, architecture.place_frequencies)
-        self.surfaces = [
-            build_surface(mesh, planes[: len(mesh)], self.boxes, architecture.plane_resolution, parts)
-            for mesh, parts in zip(meshes, residual, strict=True)
-        ]
-        self.register_buffer("base_color", torch.zeros(len(meshes[-1]), 3))
+        self.surfaces, self.boxes = build_surfaces(body, identity, vertex_ids, architecture, self.splits)
+        count = len(self.surfaces[-1].canonical)
+        finest = finest_level(architecture, self.splits), vertex_ids, self.splits
+        learnt = IdentityChange(body, identity, *finest) if architecture.learn_identity else None
+        self.identity_change = learnt
+        first = torch.logit(torch.full((count, 1), architecture.opacity))
+        self.opacity_logit = nn.Parameter(first) if architecture.learn_opacity else None
+        self.register_buffer("base_color", torch.zeros(count, 3))
         self.register_buffer("active", torch.ones(len(vertex_ids), dtype=torch.bool))
-        self.register_buffer("skin_rows", torch.full((len(meshes[-1]),), OWN))
-        self.register_buffer("trust", torch.ones(len(meshes[-1]), 2))
+        self.register_buffer("skin_rows", torch.full((count,), OWN))
+        self.register_buffer("trust", torch.ones(count, 2))
         self.register_buffer("completion", torch.zeros(0, 9))
         self._own_surfaces = tuple(self.surfaces)
         self.unseen = "nothing"
@@ -246,18 +251,20 @@ class Avatar(nn.Module):
             theta: the pose that the representation is told, see ``pose_features``; that of ``pose`` if None.
         """
         canonical = decoded.surface.canonical
-        transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        joints, moved = self.identity_changes(decoded.surface)
+        transforms = joint_transforms(pose.rotation[None], joints, canonical.parents)[0]
         theta = pose_features(pose.rotation.detach()) if theta is None else theta
         theta = theta if noise is None else theta + noise
         condition = Condition(theta, pose.expression, time)
         # One pass computes on a CPU, for all Gaussians, and knows neither pose correctives nor completion.
         plain = canonical.pose_directions is not None or len(self.completion) > 0 or rows is not None
+        plain |= moved is not None
         if self.at_once and not plain and kernels_serve(decoded.offset):
             linear = self.representation.linear_change(decoded, condition)
             if linear is not None:
                 return self._pose_at_once(decoded, linear, transforms, pose)
         blended = blend_transforms(transforms, canonical.skinning_weights)
-        shape = decoded.offset + rest_shape(canonical, pose)
+        shape = decoded.offset + rest_shape(canonical, pose, moved)
         log_scale, color_logit, pose_offset, residual = decoded.log_scale, decoded.color_logit, None, None
         rest = shape
         change = None
@@ -279,14 +286,15 @@ class Avatar(nn.Module):
             answer = self.representation.residual(decoded, means, condition, rows)
         if answer is not None:
             answer = answer if share is None else scaled_residual(answer, share)
+            answer = answer if self.residual_share == 1 else answer * self.residual_share
             residual, means = answer[:, :3], self._moved(means, blended, answer[:, 3:])
             color_logit = color_logit + residual
         gaussians = Gaussians(
             means=means,
             quaternions=decoded.surface.skinning_tables.place(transforms, shape, pose.transl)[1],
-            scales=self._scales(canonical, log_scale),
+            scales=scales_of(canonical, log_scale, self.architecture),
             colors=torch.sigmoid(color_logit),
-            opacities=self._opacities(canonical),
+            opacities=self.opacities(decoded.surface),
         )
         return Posed(gaussians, pose_offset, log_scale, color_logit, residual, rows)
 
@@ -308,7 +316,7 @@ class Avatar(nn.Module):
             posed.quaternions,
             posed.scales,
             posed.colors,
-            self._opacities(decoded.surface.canonical),
+            self.opacities(decoded.surface),
         )
         pose_offset = posed.pose_offset if active else None
         return Posed(gaussians, pose_offset, decoded.log_scale, posed.color_logit)
@@ -321,7 +329,7 @@ class Avatar(nn.Module):
                 surface.skinning_tables,
                 canonical.vertices,
                 *canonical.expressive(),
-                self._initial_scales(canonical),
+                initial_scales(canonical, self.architecture),
                 self.architecture.pose_offset_unit * surface.pose_movable,
                 (*LOG_SCALE_RANGE, LARGEST_SCALE),
             )
@@ -335,17 +343,21 @@ class Avatar(nn.Module):
         offset = move * self.architecture.pose_offset_unit
         return means + (blended[..., :3] * offset[:, None, :]).sum(-1)
 
-    def _opacities(self, canonical: Canonical) -> Tensor:
-        return torch.full((len(canonical),), self.architecture.opacity, device=self.device)
+    def identity_changes(self, surface: Surface) -> tuple[Tensor, Tensor | None]:
+        """The rest joints, [55, 3], and by how much vertices differ from the fitted identity's, [N, 3].
 
-    def _scales(self, canonical: Canonical, log_scale: Tensor) -> Tensor:
-        initial = self._initial_scales(canonical)
-        return (initial * torch.exp(log_scale.clamp(*LOG_SCALE_RANGE))).clamp(max=LARGEST_SCALE)
+        Metres; the latter is None where the identity is not learnt.
+        """
+        canonical, change = surface.canonical, self.identity_change
+        if change is None:
+            return canonical.joints, None
+        return canonical.joints + change.joints(), change.vertices(surface.rows, len(canonical))
 
-    def _initial_scales(self, canonical: Canonical) -> Tensor:
-        across = canonical.spacing * self.architecture.scale
-        thick = across.mean(1, keepdim=True) * self.architecture.thickness
-        return torch.cat([across, thick], 1)
+    def opacities(self, surface: Surface) -> Tensor:
+        """The opacities of a surface's Gaussians, [N]."""
+        if self.opacity_logit is None:
+            return torch.full((len(surface.canonical),), self.architecture.opacity, device=self.device)
+        return torch.sigmoid(surface.pick(self.opacity_logit)[:, 0])
 
     def gaussians(
         self,
@@ -382,15 +394,16 @@ class Avatar(nn.Module):
             pose: as for ``gaussians``.
         """
         canonical = surface.canonical
-        transforms = joint_transforms(pose.rotation[None], canonical.joints, canonical.parents)[0]
+        joints, moved = self.identity_changes(surface)
+        transforms = joint_transforms(pose.rotation[None], joints, canonical.parents)[0]
         blended = blend_transforms(transforms, canonical.skinning_weights)
-        shape = rest_shape(canonical, pose)
+        shape = rest_shape(canonical, pose, moved)
         return Gaussians(
             means=transform_points(blended, shape) + pose.transl,
             quaternions=surface.skinning_tables.place(transforms, shape, pose.transl)[1],
-            scales=self._scales(canonical, torch.zeros(len(canonical), 3, device=self.device)),
+            scales=scales_of(canonical, torch.zeros_like(canonical.vertices), self.architecture),
             colors=torch.sigmoid(surface.pick(self.base_color)),
-            opacities=self._opacities(canonical),
+            opacities=self.opacities(surface),
         )
 
     def unseen_surface(self) -> Surface:
@@ -403,8 +416,3 @@ class Avatar(nn.Module):
             rows = torch.nonzero(rest)[:, 0]
             known = self._restricted[-1] = self.active.clone(), restricted(self.surfaces[-1], rows)
         return known[1]
-
-
-def scaled_residual(answer: Tensor, share: Tensor) -> Tensor:
-    """A share, [N, 2], of residual colours and moves: [N, 3] or [N, 6]."""
-    return torch.cat([answer[:, :3] * share[:, :1], answer[:, 3:] * share[:, 1:]], 1)

@@ -15,9 +15,15 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.avatar.avatar import LARGEST_SCALE, LOG_SCALE_RANGE, Avatar, scaled_residual
+from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.fused_posing import PosingTables, pose_at_once
-from pipeline.avatar.posed import pose_features
+from pipeline.avatar.posed import (
+    LARGEST_SCALE,
+    LOG_SCALE_RANGE,
+    initial_scales,
+    pose_features,
+    scaled_residual,
+)
 from pipeline.avatar.representation import BakedRepresentation, Condition, Decoded, LinearChange
 from pipeline.avatar.skinning_tables import SkinningTables
 from pipeline.body import Pose, joint_transforms
@@ -32,12 +38,13 @@ class Constants:
         points: [N, 3], rest vertices and static offsets, metres.
         expressive: [M] int64, the points that expressions move.
         expressions: [M, 3, E], metres a unit of expression.
-        correctives: [N, 3, 486] bfloat16, the body's pose correctives; [0, 3, 486] if it has none.
+        correctives: [P, 3, 486] bfloat16, the body's pose correctives; [0, 3, 486] if it has none.
         scales: [N, 3], standard deviations before they change with the pose's log scales, metres.
         log_scale, color_logit: [N, 3], of the static heads.
         offset_unit: [N, 1], metres that a pose-dependent offset of 1 stands for.
         joints: [55, 3], metres.
         pose_share: [N, 2], the share that is shown of what follows the pose, colour and shape; None for all.
+        corrected: [P] int64, the points that correctives move; None for all.
     """
 
     points: Tensor
@@ -50,6 +57,7 @@ class Constants:
     offset_unit: Tensor
     joints: Tensor
     pose_share: Tensor | None = None
+    corrected: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +68,7 @@ class BakedAvatar:
         constants: of the body and of the static heads.
         skinning_tables: of the mesh.
         parents: of the joints, -1 for the root.
-        opacity: of every Gaussian.
+        opacities: [N], of the Gaussians.
         representation: the pose-dependent part.
         residual_unit: metres that a residual head's move of 1 stands for; 0 where they move nothing.
     """
@@ -68,7 +76,7 @@ class BakedAvatar:
     constants: Constants
     skinning_tables: SkinningTables
     parents: tuple[int, ...]
-    opacity: float
+    opacities: Tensor
     representation: BakedRepresentation
     residual_unit: float = 0.0
 
@@ -96,7 +104,7 @@ class BakedAvatar:
         linear = self.representation.linear_change(condition)
         if linear is not None and not len(constants.correctives) and constants.pose_share is None:
             return self._pose_at_once(linear, transforms, pose)
-        points = rest = self._rest_shape(pose)
+        points = rest = self.rest_shape(pose)
         log_scale, color_logit = constants.log_scale, constants.color_logit
         change = self.representation.change(condition, lambda: self.skinning_tables.normals(transforms, rest))
         share = constants.pose_share
@@ -121,15 +129,15 @@ class BakedAvatar:
             quaternions=quaternions,
             scales=scales.clamp_(max=LARGEST_SCALE),
             colors=color_logit.sigmoid(),
-            opacities=torch.full((len(points),), self.opacity),
+            opacities=self.opacities.clone(),
         )
 
     def _pose_at_once(self, change: LinearChange, transforms: Tensor, pose: Pose) -> Gaussians:
         """As ``gaussians`` does step by step, in one pass over the Gaussians."""
         learnt = (None, self.constants.log_scale, self.constants.color_logit, change)
         posed = pose_at_once(self.posing_tables, *learnt, transforms, pose.transl, pose.expression)
-        opacities = torch.full((len(self),), self.opacity)
-        return Gaussians(posed.means, posed.quaternions, posed.scales, posed.colors, opacities)
+        colors, opacities = posed.colors, self.opacities.clone()
+        return Gaussians(posed.means, posed.quaternions, posed.scales, colors, opacities)
 
     @functools.cached_property
     def posing_tables(self) -> PosingTables:
@@ -145,7 +153,7 @@ class BakedAvatar:
             (*LOG_SCALE_RANGE, LARGEST_SCALE),
         )
 
-    def _rest_shape(self, pose: Pose) -> Tensor:
+    def rest_shape(self, pose: Pose) -> Tensor:
         """The points before skinning, a copy: [N, 3]."""
         constants = self.constants
         moved = constants.expressions[..., : len(pose.expression)] @ pose.expression
@@ -153,7 +161,9 @@ class BakedAvatar:
         if not len(constants.correctives):
             return points
         turned = (roma.rotvec_to_rotmat(pose.rotation[1:]) - torch.eye(3)).flatten()
-        return points + (constants.correctives @ turned.to(constants.correctives.dtype)).float()
+        corrected = (constants.correctives @ turned.to(constants.correctives.dtype)).float()
+        rows = constants.corrected
+        return points + corrected if rows is None else points.index_add(0, rows, corrected)
 
 
 @torch.no_grad()
@@ -169,7 +179,7 @@ def bake(avatar: Avatar) -> BakedAvatar:
         constants=_constants(avatar, decoded),
         skinning_tables=surface.skinning_tables,
         parents=surface.canonical.parents,
-        opacity=sizes.opacity,
+        opacities=avatar.opacities(surface),
         representation=avatar.representation.bake(decoded, avatar.pose_heads_active, avatar.residuals_active),
         residual_unit=sizes.pose_offset_unit if moves else 0.0,
     )
@@ -178,16 +188,19 @@ def bake(avatar: Avatar) -> BakedAvatar:
 def _constants(avatar: Avatar, decoded: Decoded) -> Constants:
     canonical, sizes = decoded.surface.canonical, avatar.architecture
     expressive, expressions = canonical.expressive()
-    correctives, across = canonical.pose_directions, canonical.spacing * sizes.scale
+    correctives = canonical.pose_directions
+    joints, moved = avatar.identity_changes(decoded.surface)
+    points = canonical.vertices + decoded.offset
     return Constants(
-        points=canonical.vertices + decoded.offset,
+        points=points if moved is None else points + moved,
         expressive=expressive,
         expressions=expressions,
         correctives=torch.zeros(0, 3, 0) if correctives is None else correctives.bfloat16(),
-        scales=torch.cat([across, across.mean(1, keepdim=True) * sizes.thickness], 1),
+        scales=initial_scales(canonical, sizes),
         log_scale=decoded.log_scale.contiguous(),
         color_logit=decoded.color_logit.contiguous(),
         offset_unit=sizes.pose_offset_unit * decoded.surface.pose_movable,
-        joints=canonical.joints,
+        joints=joints,
         pose_share=avatar.pose_share(decoded.surface),
+        corrected=canonical.corrected,
     )

@@ -22,13 +22,17 @@ from pipeline.body import (
     BodyModel,
     Identity,
     edges,
+    joint_index,
+    mean_identity,
     part_labels,
+    pose_body,
     rest_joints,
     rest_vertices,
     subdivide,
     vertex_normals,
 )
 from pipeline.body.edge_splits import split_repeatedly
+from pipeline.body.joints import JAW
 from pipeline.body.mesh import close_mouth
 
 HEAD = ("head", "face")
@@ -45,7 +49,8 @@ class Canonical:
         faces: [F, 3] int64.
         skinning_weights: [N, 55], rows sum to 1.
         expression_directions: [N, 3, E], metres a unit of expression.
-        pose_directions: [N, 3, 486], the body's pose correctives, or None if it has none.
+        pose_directions: [P, 3, 486], the body's pose correctives of some vertices; None if it has none.
+        corrected: [P] int64, these vertices; None where they are all of them.
         parts: [N] int64, index into ``pipeline.body.parts.PARTS``.
         frames: [N, 3, 3], columns are two tangents and the outward normal at rest.
         spacing: [N, 2], how far a vertex's neighbours lie along each of the two tangents, metres.
@@ -57,12 +62,13 @@ class Canonical:
     faces: Tensor  # [F, 3]
     skinning_weights: Tensor  # [N, 55]
     expression_directions: Tensor  # [N, 3, E]
-    pose_directions: Tensor | None  # [N, 3, 486]
+    pose_directions: Tensor | None  # [P, 3, 486]
     parts: Tensor  # [N]
     frames: Tensor  # [N, 3, 3]
     spacing: Tensor  # [N, 2]
     joints: Tensor  # [55, 3]
     parents: tuple[int, ...]
+    corrected: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -84,6 +90,37 @@ class Canonical:
         start, end = directed_edges(self.faces).unbind(1)
         degree = torch.bincount(start, minlength=len(self)).clamp_min(1)
         return SparsePair.build(start, end, 1.0 / degree[start].float(), (len(self), len(self)))
+
+
+def corrected_only(canonical: Canonical, *parts: str) -> Canonical:
+    """The mesh with the body's pose correctives on some parts alone."""
+    if canonical.pose_directions is None:
+        return canonical
+    rows = torch.nonzero(canonical.is_part(*parts))[:, 0]
+    directions = canonical.pose_directions[rows].clone()
+    return dataclasses.replace(canonical, pose_directions=directions, corrected=rows)
+
+
+def open_positions(
+    body: BodyModel, identity: Identity, levels: int, vertex_ids: Tensor, splits: Sequence[Tensor] = ()
+) -> Tensor:
+    """The canonical mesh's vertices on the mean identity with legs apart and the mouth open, [N, 3] metres.
+
+    ExAvatar's coordinates of the triplane: legs that hang side by side, and lips that touch, would share
+    texels, and the same place of two people has the same features to begin with. Hips turn about Z by 1 rad
+    each, the jaw by a third about X.
+
+    Args:
+        body, identity, levels, vertex_ids, splits: as of ``build_canonical``, whose mesh it is.
+    """
+    rotation = torch.zeros(1, len(body.parents), 3)
+    rotation[0, joint_index("left_hip"), 2], rotation[0, joint_index("right_hip"), 2] = 1.0, -1.0
+    rotation[0, JAW, 0] = 1 / 3
+    nothing = torch.zeros(1, 1)
+    vertices, _ = pose_body(body, mean_identity(body), rotation, nothing, torch.zeros(1, 3))
+    faces = faces_among(close_mouth(rest_vertices(body, identity), body.faces), vertex_ids, vertices.shape[1])
+    faces, (places,) = subdivide(faces, vertices[0, vertex_ids], levels=levels)
+    return split_repeatedly(faces, splits, places)[1][0]
 
 
 def directed_edges(faces: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.avatar import Avatar
-from pipeline.avatar.evidence import Evidence
+from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.representation import Decoded
 from pipeline.avatar.surface import Surface
 from pipeline.texture.completion import complete_colors, complete_log_scales
@@ -54,11 +54,12 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
     avatar.trust.index_copy_(0, rows, evidence.together.to(avatar.trust))
     if bool((evidence.together == 1).all()):
         return
-    avatar.take_completion(rows, completed_values(decoded, evidence))
+    covers = covering_log_scale(avatar.architecture.scale)
+    avatar.take_completion(rows, completed_values(decoded, evidence, covers))
 
 
-def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
-    """What was decoded with colour and scale completed.
+def completed_values(decoded: Decoded, evidence: Evidence, covers: float) -> Decoded:
+    """What was decoded with colour and scale completed, the latter by ``covers``, a log scale.
 
     Offsets stay: what no frame shows must keep behind the silhouettes that frames do show, and training has
     put it there.
@@ -68,10 +69,11 @@ def completed_values(decoded: Decoded, evidence: Evidence) -> Decoded:
     log_scale, shape_trust = _arrays(decoded.log_scale, evidence.shape_trust)
     found = torch.from_numpy(complete_colors(segments, *told))
     logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
+    scales = complete_log_scales(segments, log_scale, shape_trust, covers)
     return dataclasses.replace(
         decoded,
         color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
-        log_scale=torch.from_numpy(complete_log_scales(segments, log_scale, shape_trust)).to(like),
+        log_scale=torch.from_numpy(scales).to(like),
     )
 
 

@@ -19,6 +19,7 @@ what evidence does not reach is completed. What looks at evidence asks for ``tru
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 
 import torch
@@ -39,6 +40,7 @@ PROTRUDES = 0.02, 0.1  # shares: wholly hidden, its rim looks out from behind a 
 KEPT = 0.005, 0.04  # mean share: nothing, and all, of what was learnt is kept; one frame of 24 is enough
 TELLS = 0.01, 0.12  # likewise, of what others are told by: one frame in eight
 EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
+COVERING = 0.75  # standard deviations in distances to the neighbours; 0.55 lets a tenth through between four
 SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
 
 
@@ -96,8 +98,17 @@ class Evidence:
         )
 
 
+def covering_log_scale(scale: float) -> float:
+    """The log scale at which no light passes between neighbours, also on long triangles.
+
+    Args:
+        scale: ``Architecture.scale``, the standard deviation at log scale 0, in distances to the neighbours.
+    """
+    return max(0.0, math.log(COVERING / scale))
+
+
 def covering(decoded: Decoded) -> Decoded:
-    """What was decoded with no Gaussian smaller than at first, when neighbours cover the surface."""
+    """What was decoded with no Gaussian smaller than at first, when neighbours all but cover the surface."""
     return dataclasses.replace(decoded, log_scale=decoded.log_scale.clamp_min(0))
 
 

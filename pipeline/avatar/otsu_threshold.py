@@ -137,6 +137,14 @@ def _why_open(tau: float, cut: float, lost: float) -> str:
     return f"a line at {tau:.2f} would take {lost:.1%} of what is seen, and there is no valley under it"
 
 
+def plain_threshold(scores: np.ndarray) -> Threshold:
+    """Otsu's threshold as it is, whatever it takes (Section 3.4); an open gate where all scores are equal."""
+    tau, separability, low_mean = otsu_threshold(histogram(scores))
+    cut, lost = share_below(scores, tau)
+    why = f"{cut:.0%} of the body is under {tau:.2f}" if tau else "all of the body is seen equally often"
+    return Threshold(tau, tau, separability, low_mean, cut, lost, why)
+
+
 def fixed_threshold(scores: np.ndarray, tau: float) -> Threshold:
     """A threshold set by hand."""
     first, separability, low_mean = otsu_threshold(histogram(scores))

@@ -12,13 +12,15 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pipeline.avatar.architecture import Architecture
+from pipeline.avatar.architecture import ON_REQUEST, Architecture
 from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.skinning_tables import OWN
 from pipeline.body import BodyModel, Identity
 from pipeline.errors import UserError, first_line
 
 FORMAT = "flexiavatar-avatar-4"
+PREVIEW = "preview.safetensors"
+"""The file beside a checkpoint that holds the avatar as it is so far."""
 IDENTITY_FIELDS = ("betas", "joint_offset", "face_offset")
 
 
@@ -62,6 +64,13 @@ def save_avatar(path: Path, avatar: Avatar) -> None:
     save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, path, metadata)
 
 
+def save_preview(folder: Path, avatar: Avatar) -> None:
+    """Replaces the avatar that a run shows of itself while it trains, in one step."""
+    partial = folder / f"{PREVIEW}.partial"
+    save_avatar(partial, avatar)
+    partial.replace(folder / PREVIEW)
+
+
 def _stored_name(name: str) -> str:
     """The name in the file of a tensor of ``Avatar.state_dict``."""
     return f"network.{name.removeprefix('representation.')}"
@@ -70,8 +79,11 @@ def _stored_name(name: str) -> str:
 def _described(architecture: Architecture) -> dict:
     """The sizes as JSON values; what an ablation alone asks for is written only where it was asked for."""
     sizes = dataclasses.asdict(architecture)
-    if not architecture.residual_moves:
-        del sizes["residual_moves"]
+    usual = Architecture()
+    for name in ON_REQUEST:
+        if sizes[name] == getattr(usual, name):
+            del sizes[name]
+    del sizes["plane_deviation"]
     if architecture.representation == "triplane":
         del sizes["representation"], sizes["bases"]
     return sizes

@@ -51,22 +51,34 @@ class Surface:
         return values[: len(self.canonical)] if self.rows is None else values[self.rows]
 
 
-def plane_regions(finest: Canonical) -> tuple[Tensor, Tensor]:
+def plane_regions(
+    finest: Canonical,
+    places: Tensor,  # [N, 3]
+) -> tuple[Tensor, Tensor]:
     """The triplane regions of the finest level's vertices, [N], and their boxes, [R, 2, 3].
 
     Head and rest of the body, or a single region when only one of them is kept.
+
+    Args:
+        finest: the mesh.
+        places: its vertices' coordinates for the triplane, metres.
     """
     head = finest.is_part(*HEAD)
     both = bool(head.any()) and not bool(head.all())
     planes = head.long() if both else torch.zeros(len(finest), dtype=torch.long)
-    return planes, bounding_boxes(finest.vertices, planes)
+    return planes, bounding_boxes(places, planes)
 
 
 def build_surface(
-    mesh: Canonical, planes: Tensor, boxes: Tensor, resolution: int, residual: tuple[Region, ...]
+    mesh: Canonical,
+    places: Tensor,  # [N, 3]
+    planes: Tensor,
+    boxes: Tensor,
+    resolution: int,
+    residual: tuple[Region, ...],
 ) -> Surface:
-    """The surface of a whole level; see ``plane_regions`` for ``planes`` and ``boxes``."""
-    coordinates = normalise(mesh.vertices, planes, boxes)
+    """The surface of a whole level; see ``plane_regions`` for ``places``, ``planes`` and ``boxes``."""
+    coordinates = normalise(places, planes, boxes)
     samples = sampling_matrix(coordinates, planes, len(boxes), resolution)
     pose_movable = (~mesh.is_part(*HEAD, *HANDS)).float()[:, None]
     return Surface(mesh, samples, mesh.neighbour_mean(), pose_movable, SkinningTables.build(mesh), residual)
@@ -105,10 +117,10 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
     chosen: dict[str, Any] = {
         name: None if (values := getattr(canonical, name)) is None else values[rows]
         for name in (
-            "vertices", "skinning_weights", "expression_directions", "pose_directions", "parts", "frames",
-            "spacing",
+            "vertices", "skinning_weights", "expression_directions", "parts", "frames", "spacing",
         )
     }  # fmt: skip
+    chosen |= _correctives(canonical, rows, place)
     mesh = dataclasses.replace(canonical, faces=faces_among(canonical.faces, rows, count), **chosen)
     features = (3 * rows[:, None] + torch.arange(3, device=rows.device)).flatten()  # a row a plane
     return dataclasses.replace(
@@ -123,6 +135,15 @@ def restricted(surface: Surface, rows: Tensor) -> Surface:
         ),
         rows=rows,
     )
+
+
+def _correctives(canonical: Canonical, rows: Tensor, place: Tensor) -> dict[str, Any]:
+    """The pose correctives of what stays; ``place`` is each vertex's new number, -1 where it goes."""
+    directions, corrected = canonical.pose_directions, canonical.corrected
+    if directions is None or corrected is None:
+        return {"pose_directions": None if directions is None else directions[rows]}
+    new = place[corrected]
+    return {"pose_directions": directions[new >= 0], "corrected": new[new >= 0]}
 
 
 def _part(region: Region, place: Tensor) -> Region:

@@ -89,11 +89,18 @@ class Triplane(nn.Module):
             is one row of the sparse product.
     """
 
-    def __init__(self, regions: int, resolution: int, channels: int, generator: torch.Generator):
-        """Draws small random features: zeros would give every point the same gradient."""
+    def __init__(
+        self,
+        regions: int,
+        resolution: int,
+        channels: int,
+        generator: torch.Generator,
+        deviation: float = 0.01,
+    ):
+        """Draws small random features: zeros give every point the same gradient in the first step."""
         super().__init__()
         shape = (regions, 3, resolution, resolution, channels)
-        self.planes = nn.Parameter(torch.randn(shape, generator=generator) * 0.01)
+        self.planes = nn.Parameter(torch.randn(shape, generator=generator) * deviation)
 
     @property
     def features(self) -> int:

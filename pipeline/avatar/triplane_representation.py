@@ -56,7 +56,8 @@ class TriplaneRepresentation(Representation):
         super().__init__()
         self._sizes, self._half_precision = sizes, half_precision
         generator = torch.Generator().manual_seed(seed)
-        self.triplane = Triplane(regions, sizes.plane_resolution, sizes.plane_channels, generator)
+        side, channels, deviation = sizes.plane_resolution, sizes.plane_channels, sizes.plane_deviation
+        self.triplane = Triplane(regions, side, channels, generator, deviation)
         features, hidden = self.triplane.features, {"width": sizes.width, "groups": sizes.groups}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

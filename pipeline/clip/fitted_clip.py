@@ -28,6 +28,7 @@ from pipeline.body import (
 )
 from pipeline.clip.boxes import Box, clip_box
 from pipeline.clip.camera import Camera
+from pipeline.clip.fit_quality import FIT_QUALITY, FitQuality, read_fit_quality
 from pipeline.clip.foreground import read_person
 from pipeline.clip.frames import read_frame, read_mask, spread_from_start
 from pipeline.clip.keypoints import Keypoints, read_keypoints
@@ -42,11 +43,12 @@ class FittedClip:
 
     Attributes:
         folder: what ingest published.
-        split: the frames to learn from and those held out; each has a pose and a camera.
+        split: the frames to learn from and those held out that the fit accepts; each has a pose and a camera.
         cameras: of every kept frame.
         body: the body model.
         identity: who the person is to it.
         poses: the fit's, of every kept frame; in the world of the cameras.
+        quality: how well the fit says that it is on the person, of every kept frame.
     """
 
     folder: Path
@@ -55,6 +57,7 @@ class FittedClip:
     body: BodyModel
     identity: Identity
     poses: Poses
+    quality: FitQuality
 
     @cached_property
     def footage(self) -> Footage:
@@ -124,16 +127,34 @@ def read_fitted_clip(ingest: Path, fit: Path, body: BodyModel | Path) -> FittedC
             and the stage to run again.
     """
     model = load_body(body) if isinstance(body, Path) else body
+    quality = read_fit_quality(fit)
     clip = FittedClip(
         folder=ingest,
-        split=read_split(ingest / "split.json"),
+        split=accepted_frames(read_split(ingest / "split.json"), quality, fit),
         cameras=read_cameras(ingest / "cameras.parquet"),
         body=model,
         identity=read_identity(fit / "identity.safetensors", model),
         poses=read_poses(fit / "poses.parquet"),
+        quality=quality,
     )
     _check(clip, fit / "poses.parquet")
     return clip
+
+
+def accepted_frames(split: Split, quality: FitQuality, fit: Path) -> Split:
+    """The split without the frames that the fit does not accept.
+
+    Raises:
+        UserError: no training frame is left.
+    """
+    refused = {*quality.frames[~quality.accepted].tolist()}
+    train, test = (tuple(one for one in part if one not in refused) for part in (split.train, split.test))
+    if not train:
+        raise UserError(
+            f"{fit / FIT_QUALITY}: the body is on the person in no training frame: see overlay.png there, "
+            "name the person (ingest.person=), or go on regardless (fit.accept=any)"
+        )
+    return Split(train, test)
 
 
 def _check(clip: FittedClip, path: Path) -> None:

@@ -37,6 +37,9 @@ CAMERA_SCHEMA = pa.schema(
         ("translation", vectors(3, pa.float64())),
     ]
 )
+SHOT_STEP = 100_000
+"""Frame numbers of a rig's n-th further camera begin at n times this."""
+
 _REMEDY = "run the ingest stage again"
 
 
@@ -133,6 +136,7 @@ class Footage:
             was applied, and what else that source has to say.
         total: how many frames the source has, whatever was looked at; 0 where it does not say.
         names: frame number, as text -> file name, of all frames of a source of pictures; empty for a video.
+        stills: whether the frames are single pictures, of which none follows another in time.
     """
 
     name: str
@@ -149,6 +153,7 @@ class Footage:
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     total: int = 0
     names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    stills: bool = False
 
     @property
     def all_frames(self) -> ClipFrames:

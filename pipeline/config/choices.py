@@ -45,3 +45,6 @@ ProtocolName = Literal["ours", "paper", "paper_black"]
 
 PlyUp = Literal["-y", "y", "z"]
 """The axis that points up in the world of a .ply for other programs; ours is y."""
+
+SplatFormat = Literal["ply", "spz", "glb"]
+"""Formats of splats; see ``pipeline.splat.splat_files``."""

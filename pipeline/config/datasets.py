@@ -12,6 +12,8 @@ A dataset is one file, ``data/datasets/<name>.toml``::
     [[paper.rows]]
     method = "RGBAvatar"
     mean = [32.72, 0.953, 6.04]                # PSNR, SSIM, LPIPS times 100; or a subject's name
+    [paper.faces]                              # optional: method -> face consistency, ArcFace's mean cosine
+    RGBAvatar = 0.79
 
 Its subjects are those whose own file says ``dataset = "insta"``: one file more in ``data/subjects`` is
 one subject more.
@@ -56,6 +58,7 @@ class Dataset:
         layer: the settings.
         table: the published table's name.
         rows: its lines.
+        faces: method -> published face consistency, the mean cosine of ArcFace's embeddings.
     """
 
     name: str
@@ -65,6 +68,7 @@ class Dataset:
     layer: Layer
     table: str
     rows: tuple[Row, ...]
+    faces: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 def known_datasets(workspace: Workspace) -> tuple[str, ...]:
@@ -88,6 +92,10 @@ def load_dataset(workspace: Workspace, name: str) -> Dataset:
         rows = tuple(_row(row) for row in paper.get("rows", ()))
     except (KeyError, TypeError, ValueError, AttributeError):
         raise UserError(f"{path}: a row of [[paper.rows]] is not method and lists of 3 numbers") from None
+    try:
+        faces = {str(method): float(cosine) for method, cosine in paper.get("faces", {}).items()}
+    except (TypeError, ValueError, AttributeError):
+        raise UserError(f"{path}: [paper.faces] is not methods and one number each") from None
     settings = {key: value for key, value in content.items() if key not in OWN}
     return Dataset(
         name=name,
@@ -97,6 +105,7 @@ def load_dataset(workspace: Workspace, name: str) -> Dataset:
         layer=Layer(str(path), settings),
         table=str(paper.get("table", "")),
         rows=rows,
+        faces=faces,
     )
 
 

@@ -9,6 +9,8 @@ settings are read by the DAG.
 What the paper says: NeuMan's test poses are refined on the image alone, and the background is masked as
 ExAvatar does (Section 4.1). What its authors' release adds: NeuMan on white, TalkShow and ZJU-MoCap on
 black, the ground-truth mask cutting both pictures, the whole image, AlexNet's LPIPS, means over frames.
+The masking is said of all tables and the refinement of NeuMan alone; the colour under INSTA and WildAvatar is
+said nowhere, and black is taken, as for all else but NeuMan.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class Protocol:
 PROTOCOLS: Mapping[ProtocolName, Protocol] = {
     "ours": Protocol("black", OWN, PLAN),
     "paper": Protocol("white", TRUTH, ON, PHOTOGRAPH),  # its NeuMan table
-    "paper_black": Protocol("black", TRUTH, OFF, PHOTOGRAPH),  # its TalkShow and ZJU-MoCap tables
+    "paper_black": Protocol("black", TRUTH, OFF, PHOTOGRAPH),  # its other tables
 }
 """The protocols by name. ``ours`` lets a silhouette that is wrong cost something."""
 

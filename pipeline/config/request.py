@@ -25,6 +25,7 @@ DEFAULT_PRESET = "quick"
 FIELDS = {
     "subject": "subjects", "dataset": "datasets", "source": "source", "preset": "preset", "verify": "verify",
     "cluster": "cluster", "cpus": "cpus", "gpus": "gpus", "budget": "budget", "scale": "scale",
+    "port": "port", "host": "host",
 }  # fmt: skip
 """Word -> the field of the request; the words of ``PLACES`` make its workspace."""
 
@@ -34,6 +35,7 @@ PLACES = {
 """Word -> the field of the workspace."""
 
 Processors = Annotated[float, Field(ge=0, le=10_000)]
+Port = Annotated[int, Field(ge=0, le=65535)]
 Footage = Annotated[Path, Strict(False), AfterValidator(Path.absolute)]
 
 
@@ -53,6 +55,8 @@ class Request:
         cpus, gpus: what a subject is given there; None: what the preset asks for.
         budget: the time that a study may take, such as ``20m``; None: its own.
         scale: the size of a study's runs.
+        port: of ``doit run view``, where its page is served; 0: any that is free.
+        host: of the same, the address that it listens on; nothing but this machine reaches 127.0.0.1.
     """
 
     subjects: tuple[str, ...] = ()
@@ -67,6 +71,8 @@ class Request:
     gpus: Processors | None = None
     budget: str | None = None
     scale: str = "preset"
+    port: Port = 8321
+    host: str = "127.0.0.1"
 
     @property
     def dataset(self) -> str | None:

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.clip.boxes import Box
 from pipeline.errors import UserError
 
 BOX_LEVEL, BOX_MARGIN = 0.3, 0.12  # the person's box: where the pose mask exceeds this, and this much around
@@ -45,6 +46,38 @@ class Estimate:
     hands: tuple[np.ndarray | None, np.ndarray | None]
     body_mask: np.ndarray
     selfie_mask: np.ndarray
+
+    def placed(self, box: Box, width: int, height: int) -> Estimate:
+        """The estimate of a whole picture, of which this is that of a box.
+
+        Args:
+            box: in the picture, inside it.
+            width, height: of the picture, in pixels of the box.
+        """
+        scale = self.body_mask.shape[1] / box.width
+        size = (max(1, round(height * scale)), max(1, round(width * scale)))
+        top, left = min(round(box.top * scale), size[0] - 1), min(round(box.left * scale), size[1] - 1)
+
+        def points(found: np.ndarray | None) -> np.ndarray | None:
+            if found is None:
+                return None
+            moved = found.copy()
+            moved[:, 0] = (box.left + found[:, 0] * box.width) / width
+            moved[:, 1] = (box.top + found[:, 1] * box.height) / height
+            moved[:, 2] = found[:, 2] * box.width / width
+            return moved
+
+        def mask(found: np.ndarray) -> np.ndarray:
+            whole = np.zeros(size, np.float32)
+            part = found[: size[0] - top, : size[1] - left]
+            whole[top : top + part.shape[0], left : left + part.shape[1]] = part
+            return whole
+
+        left_hand, right_hand = (points(hand) for hand in self.hands)
+        pose = points(self.pose)
+        assert pose is not None
+        masks = mask(self.body_mask), mask(self.selfie_mask)
+        return Estimate(pose, self.world, points(self.face), (left_hand, right_hand), *masks)
 
 
 class Estimator:

@@ -18,9 +18,12 @@ from pipeline.run.stage import Stage, upstream_first, usual
 STUDIES = ("batch", "ablate", "tradeoff", "compare")
 """Tasks that run all usual stages, of the chosen subjects."""
 
+VIEW = "view"
+"""The task that shows an avatar; with ``motion=`` it shows what animate made of that."""
+
 _OF_TASKS = {
     "cluster": ("batch",), "cpus": ("batch",), "gpus": ("batch",), "budget": ("tradeoff",),
-    "scale": ("ablate", "tradeoff"),
+    "scale": ("ablate", "tradeoff"), "port": ("view",), "host": ("view",),
 }  # fmt: skip
 
 
@@ -31,7 +34,7 @@ def named_tasks(words: Sequence[str], stages: Collection[str]) -> list[str] | No
         None where another command than run is given, which is about no words of ours.
     """
     plain = [word for word in words if "=" not in word and not word.startswith("-")]
-    known = {*stages, *STUDIES, "verify", "prune", "assets"}
+    known = {*stages, *STUDIES, VIEW, "verify", "prune", "assets"}
     tasks = [word for word in plain if word.partition(":")[0] in known]
     if plain and plain[0] != "run" and plain[0] not in tasks:
         return None
@@ -60,6 +63,7 @@ def check_effect(
     _check_footage(request, tasks)
     _check_subjects(request, tasks, stages)
     _check_study_words(words, tasks)
+    tasks = with_what_is_viewed(request, tasks)
     _check_stages(request, tasks, chosen, stages)
     run = running(tasks, stages)
     if not request.overrides and request.source is None:
@@ -70,6 +74,12 @@ def check_effect(
         except UserError:
             continue  # the stage itself reports it
         check_settings_act(job, run)
+
+
+def with_what_is_viewed(request: Request, tasks: Sequence[str]) -> list[str]:
+    """The tasks, with animate for view where a motion is to be seen: it is made first."""
+    moved = "animate.motion" in request.overrides
+    return ["animate" if task == VIEW and moved else task for task in tasks]
 
 
 def subjects_of_tasks(tasks: Sequence[str], chosen: Sequence[str]) -> list[str]:

@@ -20,6 +20,7 @@ import pandas as pd
 from pipeline.config.request import Request
 from pipeline.config.settings import read_toml
 from pipeline.errors import UserError
+from pipeline.run.job import open_job
 from pipeline.run.progress import Progress
 from pipeline.store.artifact import read_manifest
 from pipeline.studies.measure import AvatarMeter, Numbers, score_table
@@ -38,6 +39,7 @@ VARIANTS: Mapping[str, Variant] = {
     "no_gate": Variant("without visibility gate", {"plan.visibility_gate": "off"}),
     "no_masked_fit": Variant("without masked fit", {"fit.masked": "false"}),
     "weight_1": Variant("generated views' weight 1.0", {"train.generated": "1"}),
+    "weight_equal": Variant("generated views' weights as captured", {"train.generated_as_captured": "true"}),
     "moves": Variant("residual also moves positions", {"train.residual_moves": "true"}),
     "whole_body": Variant("whole-body residual", {"train.residual_parts": "face,left_hand,right_hand,rest"}),
     "fixed_threshold": Variant(f"fixed threshold {FIXED}", {"train.gate_threshold": str(FIXED)}),
@@ -135,7 +137,7 @@ def run_all(
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
-                bases[subject] = base_of(subject, request, log, {"auxiliary.generator": "auto"})
+                bases[subject] = base_of(subject, request, log, views_of(subject, request))
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
@@ -145,6 +147,12 @@ def run_all(
                 print(results[subject, key].line, flush=True)
                 progress.advance(1, variant.name)
     return bases, results
+
+
+def views_of(subject: str, request: Request) -> Mapping[str, str]:
+    """The overrides that give the whole method generated views where its settings leave them out."""
+    auxiliary = open_job(subject, request).settings["auxiliary"]
+    return {"auxiliary.generator": "auto"} if auxiliary.generator == "off" else {}
 
 
 def speeds_of(bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result]) -> dict[Path, Numbers]:

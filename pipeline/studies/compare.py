@@ -20,6 +20,7 @@ from pipeline.studies.tables import MEAN, pipe_table
 from pipeline.studies.variants import held_out_means, read_summary
 
 DIGITS = {"psnr": 2, "ssim": 3, "lpips_alex": 2}
+FACES = "arcface_cosine"
 AVATAR, REFINED = "avatar", "avatar_refined"
 OURS = {
     AVATAR: "here",
@@ -102,7 +103,30 @@ def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Meas
     under = f", {about.table}" if about.table else ""
     head = f"# {about.title}\n\nPSNR (dB) / SSIM / LPIPS x 100{under}\n"
     table = pipe_table(texts, numbers="left")
-    return "\n".join([head, table, "", *(f"- {remark}" for remark in remarks(about, subjects, found)), ""])
+    said = [f"- {remark}" for remark in remarks(about, subjects, found)]
+    return "\n".join([head, table, "", *said, "", *faces(about, subjects, found)])
+
+
+def faces(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> list[str]:
+    """The lines of the table of face consistency (ArcFace's mean cosine); none where nothing is known."""
+    rows = {f"{method} (published)": {MEAN: cosine} for method, cosine in about.faces.items()}
+    for method, name in OURS.items():
+        means = {subject: one.means.get(method, {}).get(FACES) for subject, one in found.items()}
+        known = {subject: mean for subject, mean in means.items() if mean is not None}
+        if known:
+            part = "" if len(known) == len(subjects) else f" ({len(known)} of {len(subjects)} subjects)"
+            rows[f"{name}{part}"] = known | {MEAN: sum(known.values()) / len(known)}
+    if not rows:
+        return []
+    columns = [*(subject for subject in subjects if any(subject in row for row in rows.values())), MEAN]
+    texts = [
+        {"method": name, **{one: f"{row[one]:.4f}" if one in row else "-" for one in columns}}
+        for name, row in rows.items()
+    ]
+    head = "## Face consistency\n\nThe cosine of ArcFace's embeddings of the rendered and the true face\n"
+    missing = len(rows) == len(about.faces)
+    said = ["- Not measured here: evaluate.arcface=FILE names ArcFace's ONNX file", ""] if missing else []
+    return [head, pipe_table(pd.DataFrame(texts), numbers="left"), "", *said]
 
 
 def scores(values: Mapping[str, Sequence[float | None]], subjects: Sequence[str]) -> pd.DataFrame:

@@ -1,8 +1,8 @@
 """Completion of what no frame showed well, from what frames did, within its own segment of the body.
 
 For each vertex a *guess* is made of what is known elsewhere (``guess``): its mirror image where the other
-side was seen, else what was seen on the same ring of the same limb, else of its segment. So garments end
-where they end in front, and a print on the chest, which the ring's mean levels, is not carried to the back.
+side was seen, else what was seen nearest on the same ring of the same limb, else of its segment. So garments
+end where they end in front, and what only the chest shows, a print or a shirt, is not carried to the back.
 Hair is the scalp's own: what resembles the skin of the face there, at the hairline, is no source.
 What is known beside it then bends the guess until both meet without a step, over a few centimetres
 (``screened_membrane`` of the difference: Perez et al., Poisson image editing, 2003).
@@ -27,7 +27,8 @@ REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
 """Metres over which what is known beside a guess bends it; hands as the rest."""
 
 RINGS = ((0.012, 1.0), (0.05, 1e-3), (10.0, 1e-6))  # widths along a limb, metres, and what each counts
-BIN = 0.004  # metres along a limb
+TURNS = ((0.6, 1.0), (10.0, 1e-6))  # widths around it, radians: a jacket's back is like its sides
+BIN, TURN_BINS = 0.004, 24  # metres along a limb; parts of a turn around it
 FIRM = 50.0  # how firmly a wholly trusted vertex is held, against an edge's 1
 SKIN_LIKE = 0.13  # distance of two colours, in [0, 1], at which they are hardly of one kind
 LEAST_SOURCE = 0.02  # what the skin's own colour still counts as a source of hair or cloth
@@ -71,9 +72,10 @@ def complete_log_scales(
     segments: Segments,
     log_scale: np.ndarray,  # [N, C]
     trust: np.ndarray,  # [N]
+    covers: float = 0.0,
 ) -> np.ndarray:
-    """A log scale for every vertex, [N, C] float64: 0, which covers, where nothing is known."""
-    return completed(segments, log_scale, np.zeros_like(log_scale), trust, trust)
+    """A log scale for every vertex, [N, C] float64: ``covers`` where nothing is known."""
+    return completed(segments, log_scale, np.full_like(log_scale, covers), trust, trust)
 
 
 def completed(
@@ -179,18 +181,27 @@ def _fill_rings(
         limb = np.flatnonzero(rows & (segments.part == part))
         found[limb] = whole
         if weight[limb].sum() > 0:
-            found[limb] = _ring_means(segments.along[limb], values[limb], weight[limb])
+            found[limb] = _ring_means(segments.along[limb], segments.around[limb], values[limb], weight[limb])
 
 
-def _ring_means(along: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted means of what lies at the same place along a limb, wider where nothing does: [K, C]."""
+def _ring_means(along: np.ndarray, around: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted means of what lies near along and around a limb, wider where nothing does: [K, C]."""
     place = ((along - along.min()) / BIN).astype(int)
-    count = place.max() + 1
-    heft = np.bincount(place, weight, count)
-    sums = np.stack([np.bincount(place, weight * column, count) for column in values.T], axis=1)
-    away = BIN * np.abs(np.arange(count)[:, None] - np.arange(count))
-    kernel = sum(share * np.exp(-0.5 * (away / width) ** 2) for width, share in RINGS)
-    return ((kernel @ sums) / np.maximum(kernel @ heft, 1e-30)[:, None])[place]
+    turn = ((around + np.pi) / (2 * np.pi) * TURN_BINS).astype(int) % TURN_BINS
+    shape = (place.max() + 1, TURN_BINS)
+    cell = place * TURN_BINS + turn
+    columns = [weight, *(weight * column for column in values.T)]
+    sums = np.stack([np.bincount(cell, one, shape[0] * shape[1]).reshape(shape) for one in columns])
+    apart = np.abs(np.arange(shape[0])[:, None] - np.arange(shape[0]))
+    turned = np.abs(np.arange(TURN_BINS)[:, None] - np.arange(TURN_BINS))
+    turned = np.minimum(turned, TURN_BINS - turned)
+    means = _kernel(BIN * apart, RINGS) @ sums @ _kernel(2 * np.pi / TURN_BINS * turned, TURNS)
+    return (means[1:] / np.maximum(means[0], 1e-30))[:, place, turn].T
+
+
+def _kernel(away: np.ndarray, widths: tuple[tuple[float, float], ...]) -> np.ndarray:
+    """Gaussians of several widths, each with its share, summed."""
+    return sum(share * np.exp(-0.5 * (away / width) ** 2) for width, share in widths)
 
 
 def weighted_median(

@@ -35,6 +35,7 @@ class Segments:
         label: [N] int64, FACE with the ears, SCALP, NECK, BODY (trunk, arms, legs), LEFT_HAND or RIGHT_HAND.
         part: [N] int64, index into ``PARTS``.
         along: [N] float64, metres along the part's limb: a ring around it has one value.
+        around: [N] float64, radians in [-pi, pi] about the part's limb: a line along it has one value.
         mirrored: [N] int64, the vertex nearest to each one's mirror image.
         normals: [N, 3] float64, unit, outward, at rest.
         spacing: [N] float64, mean length of the edges at a vertex, metres.
@@ -44,6 +45,7 @@ class Segments:
     label: np.ndarray
     part: np.ndarray
     along: np.ndarray
+    around: np.ndarray
     mirrored: np.ndarray
     normals: np.ndarray
     spacing: np.ndarray
@@ -90,10 +92,18 @@ def find_segments(
         label=label,
         part=part,
         along=np.where(along_x, np.abs(places[:, 0]), places[:, 1]),
+        around=_angles(np.where(along_x, places[:, 1], places[:, 0]), places[:, 2], part),
         mirrored=cKDTree(places).query(places * [-1, 1, 1])[1].astype(np.int64),
         normals=vertex_normals(vertices, faces).double().numpy(),
         spacing=total / np.maximum(degree, 1),
     )
+
+
+def _angles(across: np.ndarray, forward: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Angles about the middle of each part, 0 in front: [N] radians."""
+    size = np.maximum(np.bincount(part), 1)
+    middle = [np.bincount(part, values) / size for values in (across, forward)]
+    return np.arctan2(across - middle[0][part], forward - middle[1][part])
 
 
 def _labels(vertices: Tensor, weights: Tensor, parts: Tensor, joints: Tensor) -> np.ndarray:

@@ -13,7 +13,7 @@ def loans(settings: AnimateSettings) -> tuple[Loan, ...]:
 
 STAGE = Stage(
     name="animate",
-    version=2,
+    version=3,
     settings=AnimateSettings,
     run="stages.animate.run:run",
     needs={

@@ -44,6 +44,12 @@ class Animation:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    @property
+    def poses(self) -> Poses:
+        """The poses, frames numbered from 0."""
+        placed = self.placed
+        return Poses(tuple(range(len(placed))), placed.rotation, placed.expression, placed.transl)
+
 
 @dataclasses.dataclass(frozen=True)
 class ClipStart:

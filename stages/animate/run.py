@@ -6,22 +6,24 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 
 from pipeline.avatar import Avatar, load_avatar
-from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints
+from pipeline.body import JOINT_NAMES, BodyModel, load_body, read_poses, rest_joints, write_poses
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import over, to_bytes
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.records import read_cameras, read_split, write_cameras
+from pipeline.config.choices import SplatFormat
 from pipeline.files.json_files import write_json
 from pipeline.pictures import PAPER, contact_sheet, shrunk
 from pipeline.pose_files import read_hand_mean
 from pipeline.run.stage import Context
-from pipeline.splat import Gaussians, Rendering, render, write_ply
+from pipeline.splat import Gaussians, Rendering, render
+from pipeline.splat.splat_files import write_splats
 from stages.animate.actor import Actor, PoseRange, legs_share, make_actor
 from stages.animate.cameras import Animation, cameras_of, clip_start, turntable
 from stages.animate.exr_layers import NAMES, exr_layers, write_layers
@@ -32,6 +34,7 @@ from stages.animate.motions.read import DrivenPerson, read_motion, with_relaxed_
 from stages.animate.motions.source import TURNTABLE, motion_source
 from stages.animate.settings import AnimateSettings
 
+SPLATS = get_args(SplatFormat)
 _HALF_LEGS = 0.5  # share of the legs' Gaussians from which on an avatar can walk
 _WORTH_BAKING = 24  # poses; baking 54,000 Gaussians takes as long as it saves in about so many
 _SHOWN = 12  # joints named in a line
@@ -41,8 +44,9 @@ _SHEET_COLUMNS, _SHEET_SIDE = 4, 320  # of frames.png; pixels of a picture's lon
 def run(context: Context) -> None:
     """Animates one subject.
 
-    Publishes ``frames.png``, ``cameras.parquet`` and ``animate.json``, and what is asked for of
-    ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and ``ply/<frame>.ply``, frames numbered from 0.
+    Publishes ``frames.png``, ``cameras.parquet``, ``motion.parquet`` (the poses) and ``animate.json``, and
+    what is asked for of ``animation.mp4``, ``exr/<frame>.exr`` (see ``layers``) and splats,
+    ``ply/<frame>.ply``, ``spz/`` and ``glb/``, frames numbered from 0.
 
     Raises:
         UserError: the motion cannot be read, or a file of an upstream stage is missing or damaged.
@@ -62,6 +66,7 @@ def run(context: Context) -> None:
     cameras = frame_cameras(context, animation, actor, body)
     draw_animation(context, animation, actor, cameras)
     write_cameras(context.output / "cameras.parquet", dict(enumerate(cameras)))
+    write_poses(context.output / "motion.parquet", animation.poses)
     write_json(context.output / "animate.json", summary(settings, animation, actor, legs, idle))
     log_result(context, animation, len(actor))
 
@@ -115,7 +120,7 @@ def frame_cameras(context: Context, animation: Animation, actor: Actor, body: Bo
 def draw_animation(context: Context, animation: Animation, actor: Actor, cameras: list[Camera]) -> None:
     """Draws every frame once and writes what is asked for."""
     settings: AnimateSettings = context.settings
-    for kind in ("exr", "ply"):
+    for kind in ("exr", *SPLATS):
         if kind in settings.outputs:
             (context.output / kind).mkdir()
     wanted = settings.sheet_frames
@@ -162,9 +167,11 @@ def drawn_frames(
         with torch.no_grad():
             rendering = render(gaussians, camera)
         timer.note("render")
-        if "ply" in settings.outputs and fresh:
-            write_ply(context.output / "ply" / f"{frame:06d}.ply", gaussians, settings.ply_up)
-            timer.note("ply")
+        for kind in SPLATS:
+            if kind in settings.outputs and fresh:
+                file = context.output / kind / f"{frame:06d}.{kind}"
+                write_splats(file, gaussians, settings.ply_up, context.subject)
+                timer.note(kind)
         if "exr" in settings.outputs:
             layers = exr_layers(gaussians, actor.parts, camera, rendering)
             timer.note("layers")

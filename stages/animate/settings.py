@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from pipeline.config.choices import PlyUp, Up
+from pipeline.config.choices import PlyUp, SplatFormat, Up
 from pipeline.config.settings import SETTINGS, Angle, CountOrNone, EvenSide, FrameRate, Frames, setting
 from pipeline.errors import UserError
 from stages.animate.motions.source import TURNTABLE, motion_source
@@ -18,7 +18,7 @@ NAMED_COLORS: Mapping[ColorName, str] = {
     "grey": "#d1d1d1", "black": "#000000", "white": "#ffffff", "green": "#00b140",
 }  # fmt: skip
 HexColor = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$", examples=["#00b140"])]
-Output = Literal["video", "exr", "ply"]
+Output = Literal["video", "exr", SplatFormat]
 Outputs = Annotated[tuple[Output, ...], Field(min_length=1)]
 Fps = Annotated[float, Field(ge=0, le=1000)]
 LastFrame = Annotated[int, Field(ge=-1, le=1_000_000_000)]
@@ -35,7 +35,8 @@ class AnimateSettings:
         "does in its clip), or turntable: the avatar stands still and is turned",
     )
     outputs: Outputs = setting(
-        ("video",), "what is written: video, exr (named layers in linear light), ply (splats, a file a frame)"
+        ("video",),
+        "what is written: video, exr (named layers in linear light), splats, a file a frame: ply, spz, glb",
     )
     width: EvenSide = setting(512, "pixels; with camera=clip the clip's picture is fitted into them")
     height: EvenSide = setting(512, "pixels")

@@ -17,7 +17,7 @@ STAGE = Stage(
             "keypoints.parquet",
             "split.json",
         ),
-        "fit": ("identity.safetensors", "poses.parquet"),
+        "fit": ("identity.safetensors", "poses.parquet", "fit_quality.parquet"),
         "plan": ("plan.json",),
     },
     assets=lambda settings: settings.assets,

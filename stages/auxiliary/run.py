@@ -18,6 +18,7 @@ from stages.auxiliary.generator_output import GeneratedPicture, GeneratorOutput
 from stages.auxiliary.guidance import write_guidance
 from stages.auxiliary.publish import publish
 from stages.auxiliary.reference import make_reference
+from stages.auxiliary.settings import AuxiliarySettings
 from stages.auxiliary.skeleton import turntable_keypoints
 from stages.auxiliary.texture_generator import complete, painted
 from stages.auxiliary.turntable_motion import TurntableMotion, make_turntable_motion, read_numbered_clip
@@ -75,9 +76,28 @@ def chosen_generator(context: Context) -> str:
     called_for = plan is not None and read_plan(plan / "plan.json").on("auxiliary_views")
     if generator == "off" and called_for:
         context.log("the plan asks for views that no frame shows: auxiliary.generator=auto makes them")
+    if generator == "named":
+        return named_generator(context.settings)
     if generator != "auto":
         return generator
     return "texture" if called_for else "off"
+
+
+def named_generator(settings: AuxiliarySettings) -> str:
+    """``mimicmotion`` or ``folder``, whichever is named; never another in their place.
+
+    Raises:
+        UserError: neither is.
+    """
+    if settings.folder:
+        return "folder"
+    if settings.weights:
+        return "mimicmotion"
+    raise UserError(
+        "generated views are asked for, and none can be made: name the folder of MimicMotion's weights as "
+        "auxiliary.weights=FOLDER or frames made elsewhere as auxiliary.folder=FOLDER_OR_VIDEO, take "
+        "auxiliary.generator=texture, or go without them: auxiliary.generator=off"
+    )
 
 
 def generated(context: Context, generator: str, clip: FittedClip, turn: TurntableMotion) -> GeneratorOutput:

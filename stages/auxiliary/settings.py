@@ -16,7 +16,7 @@ TurnSide = Annotated[int, Field(ge=64, le=8192)]
 Levels = Annotated[int, Field(ge=0, le=2)]
 Steps = Annotated[int, Field(ge=1, le=10_000)]
 
-MEASURED = ("mimicmotion", "folder")  # generators whose frames have to be looked at
+MEASURED = ("mimicmotion", "folder", "named")  # generators whose frames have to be looked at
 
 
 @dataclass(frozen=True, config=SETTINGS)
@@ -24,8 +24,10 @@ class AuxiliarySettings:
     """Settings of the auxiliary stage."""
 
     # auto costs a minute and some of the seen side's quality, so that the quick preset leaves it.
-    generator: Literal["auto", "off", "guidance", "texture", "mimicmotion", "folder"] = setting(
-        "off", "auto: texture where the plan asks for views; guidance: only what a generator elsewhere needs"
+    generator: Literal["auto", "off", "guidance", "texture", "mimicmotion", "folder", "named"] = setting(
+        "off",
+        "auto: texture where the plan asks for views; guidance: only what a generator elsewhere needs; "
+        "named: mimicmotion or folder, whichever of weights and folder is given",
     )
     folder: str = setting("", "of folder: frames that somebody made, or a video file")
     weights: str = setting("", "of mimicmotion: the folder with the model's weights")

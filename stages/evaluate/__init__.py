@@ -5,7 +5,7 @@ from stages.evaluate.settings import EvaluateSettings
 
 STAGE = Stage(
     name="evaluate",
-    version=6,
+    version=7,
     settings=EvaluateSettings,
     run="stages.evaluate.run:run",
     needs={
@@ -25,6 +25,7 @@ STAGE = Stage(
         "fit": (
             "identity.safetensors",
             "poses.parquet",
+            "fit_quality.parquet",
             "curve.parquet",
             "residuals.parquet",
             "overlay.mp4",
@@ -42,6 +43,6 @@ STAGE = Stage(
     },
     assets=lambda settings: settings.assets,
     reads_body=True,
-    path_settings=("second_mask",),
-    path_words=("off", "edge", "estimator", "independent"),
+    path_settings=("second_mask", "arcface"),
+    path_words=("", "off", "edge", "estimator", "independent"),
 )

@@ -42,6 +42,15 @@ class EvaluatedClip(FittedClip):
         refined = frame not in self.split.test and frame in self.trained.frames
         return (self.trained if refined else self.poses).pose(frame)
 
+    def shown_poses(self) -> Poses:
+        """The pose of every frame, as ``pose`` gives it."""
+        return Poses.stack(self.poses.frames, [self.pose(frame) for frame in self.poses.frames])
+
+    def frames_a_second(self) -> float:
+        """How many of the kept frames a second has; 0 where the source has no clock."""
+        times = sorted(self.seconds.values())
+        return 0.0 if len(times) < 2 or times[-1] <= times[0] else (len(times) - 1) / (times[-1] - times[0])
+
     def person(self, frame: int, background: str = BLACK) -> Tensor:
         """The person on a background, [H, W, 3] float32 in [0, 1]."""
         return composite_frame(self.true_colors(frame), self.mask(frame), background)

@@ -21,6 +21,7 @@ from pipeline.clip.boxes import Box
 from pipeline.clip.composite import BACKGROUNDS, BLACK, WHITE, cut_out, to_bytes
 from pipeline.config.evaluation_protocol import OWN, TRUTH
 from pipeline.finite import require_finite
+from pipeline.metrics.arcface import five_points
 from pipeline.metrics.face_identity import RecognizedFace, identity_cosine, identity_distance
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.psnr import psnr
@@ -36,6 +37,13 @@ class FaceEmbedder(Protocol):
 
     def read(self, image: np.ndarray, box: Box | None = None) -> RecognizedFace | None:
         """The face in [H, W, 3] uint8 RGB, or None."""
+
+
+class AlignedFaceEmbedder(Protocol):
+    """Embeds a face by where its points are; :class:`pipeline.metrics.arcface.ArcFace` is one."""
+
+    def embed(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """The embedding of the face in [H, W, 3] uint8 RGB whose five points are [5, 2], pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +167,7 @@ class FrameTruth:
         on: the person before it is composited.
         mask: [H, W] uint8, soft alpha.
         boxes: region -> its crops.
+        points: [133, 3], what was detected in the frame, pixels and scores; None where nothing was.
     """
 
     frame: int
@@ -169,6 +178,7 @@ class FrameTruth:
     on: OnBackground
     mask: np.ndarray  # [H, W]
     boxes: Mapping[str, list[Box]]
+    points: np.ndarray | None = None
 
     @cached_property
     def interior(self) -> Tensor:
@@ -250,3 +260,26 @@ def face_metrics(
             found[method]["identity_distance"] = identity_distance(shown.embedding, true.embedding)
             found[method]["identity_cosine"] = identity_cosine(shown.embedding, true.embedding)
     return found
+
+
+def arcface_metrics(
+    arcface: AlignedFaceEmbedder, pictures: Mapping[str, Tensor], truth: FrameTruth
+) -> dict[str, dict[str, float]]:
+    """The paper's FC (supplement E.2): the cosine of ArcFace's embeddings of a method's face and the true.
+
+    Args:
+        arcface: embeds faces.
+        pictures: method -> [H, W, 3] float in [0, 1].
+        truth: of the frame, by whose points all are aligned.
+
+    Returns:
+        Method -> ``arcface_cosine``; empty where the frame's five face points are not all trusted.
+    """
+    points = None if truth.points is None else five_points(truth.points)
+    if points is None:
+        return {}
+    true = arcface.embed(to_bytes(truth.picture.image), points)
+    return {
+        method: {"arcface_cosine": identity_cosine(arcface.embed(to_bytes(picture), points), true)}
+        for method, picture in pictures.items()
+    }

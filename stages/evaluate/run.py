@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from pipeline.avatar import load_avatar
+from pipeline.avatar import Avatar, load_avatar
 from pipeline.body import Pose
 from pipeline.clip.curves import read_curve
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
@@ -22,18 +22,22 @@ from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
 from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
+from pipeline.metrics.arcface import ArcFace
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
 from pipeline.run.job import peak_memory, shown
 from pipeline.run.stage import Context
 from pipeline.run.versions import versions
-from pipeline.splat import Gaussians, write_ply
+from pipeline.splat import Gaussians
 from pipeline.store import artifact
+from pipeline.viewer.page import viewer_page
+from pipeline.viewer.shown import NOVEL_FRAMES, filmed_motion, novel_motion, packed_avatar
 from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
-from stages.evaluate.frame_metrics import FaceEmbedder, Scorer
+from stages.evaluate.exports import Rig, avatar_rig, write_exports
+from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer
 from stages.evaluate.methods import (
     AVATAR,
     REFINED,
@@ -44,8 +48,9 @@ from stages.evaluate.methods import (
     pose_gradient_animation,
 )
 from stages.evaluate.other_cameras import camera_folders, read_true_surface, score_other_cameras
+from stages.evaluate.refinement_allowance import allowance, is_asked_for, steps_of
 from stages.evaluate.report.omissions import omissions
-from stages.evaluate.report.page import ReportContents, write_report
+from stages.evaluate.report.page import ReportContents, video_uri, write_report
 from stages.evaluate.report.pictures import (
     GAP,
     Comparisons,
@@ -62,8 +67,8 @@ from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import summarise
 from stages.evaluate.test_pose_refinement import (
     NOT_REFINED,
+    PictureLoss,
     RefinedTestPoses,
-    is_called_for,
     refine,
     write_refined,
 )
@@ -85,8 +90,9 @@ def run(context: Context) -> None:
     """Evaluates the trained avatar of one subject.
 
     Publishes ``metrics.parquet``, ``summary.json``, ``report.html``, ``comparison.png``, ``cover.png``,
-    ``turntable.mp4``, ``motion.mp4`` and ``avatar.ply``, and ``test_poses.parquet`` where the test poses were
-    refined.
+    ``turntable.mp4``, ``motion.mp4``, the splats ``avatar.ply``, ``avatar.spz`` and ``avatar_splats.glb``,
+    the rigged mesh ``avatar.glb``; ``avatar.html`` where it was asked for, and ``test_poses.parquet`` where
+    the test poses were refined.
 
     Raises:
         UserError: a file of an upstream stage or an asset is missing or damaged.
@@ -99,6 +105,7 @@ def run(context: Context) -> None:
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
     animate, mesh = baked_animation(avatar), make_mesh(context, clip)
+    rig = avatar_rig(avatar, clip.body, context.body_file, relaxed(clip, settings))
     evaluate(
         context,
         clip,
@@ -110,10 +117,24 @@ def run(context: Context) -> None:
         embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
+        arcface=ArcFace(Path(settings.arcface)) if settings.arcface else None,
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
+        rig=rig,
+        packed=pack_avatar(context, clip, avatar) if settings.interactive else None,
         start=start,
     )
+
+
+def pack_avatar(context: Context, clip: EvaluatedClip, avatar: Avatar) -> bytes:
+    """The avatar for the interactive page, with the motion that was never filmed and the clip's own."""
+    settings: EvaluateSettings = context.settings
+    start, poses = time.monotonic(), clip.shown_poses()
+    novel = novel_motion(settings.arm_angle, settings.motion_frames or NOVEL_FRAMES, settings.turntable_fps)
+    motions = [novel, filmed_motion(poses, clip.cameras, clip.frames_a_second())]
+    packed = packed_avatar(avatar, poses, motions, context.body_file, settings.arm_angle)
+    context.timing("page_seconds", time.monotonic() - start)
+    return packed
 
 
 def make_mesh(context: Context, clip: EvaluatedClip) -> TexturedMesh | None:
@@ -153,8 +174,11 @@ def evaluate(
     mesh: TexturedMesh | None = None,
     second: SecondMask | None = None,
     embedder: FaceEmbedder | None = None,
+    arcface: AlignedFaceEmbedder | None = None,
     other_cameras: Sequence[TableRow] = (),
     surface: SeenSurface | None = None,
+    rig: Rig | None = None,
+    packed: bytes | None = None,
     start: float | None = None,
 ) -> None:
     """Evaluates whatever turns a pose into Gaussians; everything is written to ``context.output``.
@@ -168,8 +192,11 @@ def evaluate(
         mesh: the textured mesh, where it is scored.
         second: the second masks, where the ceiling is measured.
         embedder: of faces, where they are compared.
+        arcface: the same as the paper does, where it is asked for.
         other_cameras: scores in cameras that are not the clip's.
         surface: of the Gaussians, if they are to be looked at from all sides.
+        rig: the body with the avatar's colours, if it is to be published.
+        packed: the avatar for the interactive page, see ``pipeline.viewer.packed``; None without one.
         start: when the stage began, by ``time.monotonic``; now if None.
     """
     settings: EvaluateSettings = context.settings
@@ -182,21 +209,27 @@ def evaluate(
     refined_avatar = AvatarMethod(REFINED, clip, animate, refined.poses.keys(), refined.poses)
     methods: list[Method] = [avatar, refined_avatar, mean, nearest, *([mesh] if mesh else []), second]
     comparisons = empty_comparisons(clip, settings)
-    table = score_table([*score(context, clip, methods, scorer, embedder, comparisons), *other_cameras])
+    table = score_table(
+        [*score(context, clip, methods, scorer, (embedder, arcface), comparisons), *other_cameras]
+    )
     write_scores(context.output / "metrics.parquet", table)
-    relaxed = relaxed_gaussians(clip, animate, settings)
-    write_ply(context.output / "avatar.ply", relaxed, context.settings.ply_up)
-    cover = write_pictures(context, avatar, relaxed, comparisons)
+    standing = relaxed_gaussians(clip, animate, settings)
+    files = write_exports(context, standing, rig)
+    cover = write_pictures(context, avatar, standing, comparisons)
     summary = summarise(context, clip, table, scorer, nearest.nearest, refined, gate, second)
-    summary["gaussians"] = len(relaxed)
-    turned = turn(context, relaxed, surface)
+    summary["gaussians"], summary["files"] = len(standing), dict(files)
+    turned = turn(context, standing, surface)
     summary["turned"] = None if turned is None else turned.numbers
-    summary["verdict"] = verdict(summary, clip_coverage(context, plan, gate))
+    summary["verdict"] = verdict(summary, clip_coverage(context, clip, plan, gate))
     write_json(context.output / "summary.json", summary)
     contents = report_contents(
         context, clip, summary, table, comparisons, cover, (plan, refined, gate), time.monotonic() - start
     )
-    contents = dataclasses.replace(contents, turned=turned)
+    contents = dataclasses.replace(contents, turned=turned, packed=packed)
+    if packed is not None:
+        film = video_uri(context.output / "turntable.mp4")
+        page = viewer_page(context.subject, packed, film)
+        (context.output / "avatar.html").write_text(page, encoding="utf-8")
     write_report(context.output / "report.html", contents)
     show_summary(summary, shown(report_place(context.output)))
 
@@ -217,14 +250,14 @@ def score(
     clip: EvaluatedClip,
     methods: Sequence[Method],
     scorer: Scorer,
-    embedder: FaceEmbedder | None,
+    faces: tuple[FaceEmbedder | None, AlignedFaceEmbedder | None],
     comparisons: Comparisons,
 ) -> list[TableRow]:
     """The scores of the clip; ``comparisons`` gets the pictures that are shown."""
     frames = frames_to_score(clip, context.settings.training_frames)
     start, rows = time.monotonic(), []
     with context.progress(len(frames), "scoring") as progress:
-        for scored in score_clip(clip, methods, scorer, frames, embedder):
+        for scored in score_clip(clip, methods, scorer, frames, *faces):
             rows += scored.rows
             comparisons.add(scored)
             progress.advance()
@@ -235,18 +268,30 @@ def score(
 def refine_test_poses(
     context: Context, clip: EvaluatedClip, plan: Plan, follow: Animate, background: str
 ) -> RefinedTestPoses:
-    """Refines the held-out frames' poses where that is called for, and publishes them."""
+    """Refines the held-out frames' poses as far as that is allowed, and publishes them."""
     settings: EvaluateSettings = context.settings
-    frames = clip.split.test
-    if not frames or not is_called_for(settings, plan):
+    curve = read_curve(context.inputs["train"] / "curve.parquet", "run the train stage again")
+    allowed = allowance(clip, settings, is_asked_for(settings, plan), steps_of(curve))
+    if not allowed.frames:
         return NOT_REFINED
+    context.log(allowed.why)
     start = time.monotonic()
-    with context.progress(len(frames), "refining test poses") as progress:
-        refined = refine(clip, follow, background, settings.refine_steps, progress.advance)
+    with context.progress(len(allowed.frames), "refining test poses") as progress:
+        perceptual, advance = refinement_lpips(context), progress.advance
+        refined = refine(clip, follow, background, allowed.steps, advance, perceptual, allowed.frames)
     context.timing("refinement_seconds", time.monotonic() - start)
     write_refined(context.output / "test_poses.parquet", refined)
     context.log(refinement_cost(context, refined))
     return refined
+
+
+def refinement_lpips(context: Context) -> PictureLoss | None:
+    """The weighted LPIPS of the refinement; None where it has no weight."""
+    settings: EvaluateSettings = context.settings
+    if not settings.refine_lpips:
+        return None
+    network = Lpips(context.assets["lpips"], settings.refine_lpips_network)
+    return lambda image, truth: settings.refine_lpips * network(image, truth)[0]
 
 
 def refinement_cost(context: Context, refined: RefinedTestPoses) -> str:
@@ -262,9 +307,14 @@ def refinement_cost(context: Context, refined: RefinedTestPoses) -> str:
 
 @torch.no_grad()
 def relaxed_gaussians(clip: EvaluatedClip, animate: Animate, settings: EvaluateSettings) -> Gaussians:
-    """The canonical avatar in the turn's pose, facing +Z at the origin, without expression."""
+    """The avatar in the turn's pose."""
+    return animate(relaxed(clip, settings), None)
+
+
+def relaxed(clip: EvaluatedClip, settings: EvaluateSettings) -> Pose:
+    """The turn's pose, facing +Z at the origin, without expression."""
     expression = torch.zeros(clip.poses.expression.shape[1])
-    return animate(Pose(relaxed_pose(settings.arm_angle), expression, torch.zeros(3)), None)
+    return Pose(relaxed_pose(settings.arm_angle), expression, torch.zeros(3))
 
 
 def write_pictures(
@@ -309,10 +359,10 @@ def write_motion(context: Context, avatar: AvatarMethod) -> None:
     context.timing("motion_seconds", time.monotonic() - start)
 
 
-def clip_coverage(context: Context, plan: Plan, gate: GateRecord) -> ClipCoverage:
-    """The parts of the person that the clip shows."""
+def clip_coverage(context: Context, clip: EvaluatedClip, plan: Plan, gate: GateRecord) -> ClipCoverage:
+    """The parts of the person that the clip shows, and how well the body fits it."""
     unmodelled, azimuths = 1 - gate.kept / gate.vertices, plan["auxiliary_views"].values
-    return ClipCoverage(unmodelled, azimuths, fit_error(context.inputs["fit"]))
+    return ClipCoverage(unmodelled, azimuths, fit_error(context.inputs["fit"]), clip.quality)
 
 
 def report_contents(

@@ -17,10 +17,12 @@ from pipeline.metrics.flicker import flicker
 from pipeline.metrics.regions import region_boxes
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.frame_metrics import (
+    AlignedFaceEmbedder,
     FaceEmbedder,
     FrameTruth,
     ScoredPicture,
     Scorer,
+    arcface_metrics,
     composite_metrics,
     face_metrics,
     picture_metrics,
@@ -61,7 +63,8 @@ class TableRow:
         method: one of ``METHODS``.
         metric: ``psnr``, ``psnr_interior``, ``psnr_person`` (dB), ``ssim``, ``lpips_alex`` or ``lpips_vgg``;
             ``psnr_face``, ``ssim_hands`` and so on of crops; ``psnr_white_truth`` and so on of composites;
-            ``flicker`` (levels of 255); ``identity_distance``, ``identity_cosine``, ``identity_found``;
+            ``flicker`` (levels of 255); ``identity_distance``, ``identity_cosine``, ``identity_found``,
+            ``arcface_cosine``;
             ``psnr_seen`` and ``psnr_unseen`` (dB) of surface that training frames show, or do not, and
             ``unseen_share``, the latter's part of the person.
         value: as the metric is defined, not times 100; NaN where it is not defined.
@@ -110,6 +113,7 @@ def score_clip(
     scorer: Scorer,
     frames: Iterable[tuple[str, int]],
     embedder: FaceEmbedder | None = None,
+    arcface: AlignedFaceEmbedder | None = None,
 ) -> Iterator[ScoredFrame]:
     """Scores one frame after another.
 
@@ -119,11 +123,12 @@ def score_clip(
         scorer: the metrics.
         frames: (split, frame) pairs.
         embedder: compares faces; they are not compared if None.
+        arcface: compares them as the paper does, likewise.
     """
     before: ScoredFrame | None = None
     for split, frame in frames:
         truth = frame_truth(clip, scorer, split, frame)
-        before = score_frame(truth, methods, before_of(clip, before, truth), embedder)
+        before = score_frame(truth, methods, before_of(clip, before, truth), embedder, arcface)
         yield before
 
 
@@ -133,7 +138,8 @@ def frame_truth(clip: EvaluatedClip, scorer: Scorer, split: str, frame: int) -> 
     view = OTHER_CAMERA if split == HELD_OUT and frame in clip.other_cameras else ""
     boxes = {} if points is None else region_boxes(points, camera.width, camera.height)
     on = partial(clip.person, frame)
-    return FrameTruth(frame, split, view, scorer, scorer.composited(on), on, clip.mask(frame), boxes)
+    seen = scorer.composited(on)
+    return FrameTruth(frame, split, view, scorer, seen, on, clip.mask(frame), boxes, points)
 
 
 def before_of(clip: EvaluatedClip, last: ScoredFrame | None, truth: FrameTruth) -> ScoredFrame | None:
@@ -148,6 +154,7 @@ def score_frame(
     methods: Sequence[Method],
     before: ScoredFrame | None = None,
     embedder: FaceEmbedder | None = None,
+    arcface: AlignedFaceEmbedder | None = None,
 ) -> ScoredFrame:
     """Scores every method that shows a frame.
 
@@ -156,6 +163,7 @@ def score_frame(
         methods: what is scored; the avatar among them.
         before: the frame before, for flicker; None where there is none.
         embedder: compares the faces of held-out frames.
+        arcface: compares them as the paper does.
     """
     on = {method.name: method.render(truth.frame) for method in methods if truth.frame in method.frames}
     shown = {name: truth.scorer.cut(picture, truth.mask) for name, picture in on.items()}
@@ -167,9 +175,11 @@ def score_frame(
     if truth.split == HELD_OUT:
         groups += [(name, composite_metrics(on[name], truth)) for name in COMPOSITED if name in on]
         groups += [(CEILING, found[CEILING])] if CEILING in found else []
+        faces = {name: shown[name].image for name in WITH_FACES if name in shown}
         if embedder is not None:
-            faces = {name: shown[name].image for name in WITH_FACES if name in shown}
             groups += face_metrics(embedder, faces, truth).items()
+        if arcface is not None:
+            groups += arcface_metrics(arcface, faces, truth).items()
     rows = [
         TableRow(truth.frame, truth.split, method, metric, value, truth.view)
         for method, values in groups

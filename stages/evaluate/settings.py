@@ -31,11 +31,14 @@ from pipeline.config.settings import (
     NotEmpty,
     Positive,
     Seed,
+    Weight,
     setting,
 )  # fmt: skip
 
 Rounds = Annotated[int, Field(ge=1, le=1_000_000)]
 Share = Annotated[float, Field(gt=0, lt=1)]
+ShareOrNone = Annotated[float, Field(ge=0, le=100)]
+TextureSide = Annotated[int, Field(ge=16, le=8192)]
 Auto = Literal["auto"]
 
 
@@ -44,7 +47,7 @@ class EvaluateSettings:
     """Settings of the evaluate stage; frames of which there are several are evenly spaced."""
 
     # Sets of the four choices below it: paper is NeuMan's (white, the truth's mask on both pictures, test
-    # poses refined), paper_black TalkShow's and ZJU-MoCap's (black, the truth's mask on both).
+    # poses refined), paper_black that of its other tables (black, the truth's mask on both).
     protocol: ProtocolName = setting(
         "ours", "a named set of choices, see pipeline/config/evaluation_protocol.py"
     )
@@ -63,6 +66,11 @@ class EvaluateSettings:
         "auto: as the protocol says",
     )
     refine_steps: Rounds = setting(60, "steps of that refinement, a frame")
+    refine_share: ShareOrNone = setting(
+        0.2, "what it may cost where nothing asks for it, of training's steps times pixels; 0: nothing"
+    )
+    refine_lpips: Weight = setting(0.0, "weight of LPIPS in it, beside 0.8 L1 and 0.2 SSIM")
+    refine_lpips_network: LpipsNetwork = setting("vgg", "its backbone")
     lpips_networks: tuple[LpipsNetwork, ...] = setting(
         ("alex",), "backbones of LPIPS; on a CPU VGG costs twenty times what AlexNet does"
     )
@@ -81,6 +89,9 @@ class EvaluateSettings:
     identity: bool = setting(
         False, "compare faces by dlib's embedding: needs the assets dlib and identity, 0.15 s a picture"
     )
+    arcface: str = setting(
+        "", "ArcFace's ONNX file (112 x 112 pixels to 512 numbers): faces are compared as the paper does"
+    )
     bootstrap_rounds: Rounds = setting(2000, "samples that are drawn for the intervals")
     bootstrap_seed: Seed = setting(0, "of those draws")
     confidence: Share = setting(0.95, "share of the drawn means that lie inside an interval")
@@ -94,9 +105,15 @@ class EvaluateSettings:
     turntable_height: EvenSide = setting(640, "pixels of the turn")
     turntable_fps: FrameRate = setting(30.0, "frames a second of the turn, and of the motion")
     ply_up: PlyUp = setting("-y", "the axis that points up in avatar.ply; most viewers show -y upright")
+    glb_texture: TextureSide = setting(1024, "pixels of the side of avatar.glb's texture")
     arm_angle: Angle = setting(1.0, "how far the arms hang below the T pose in the turn, radians")
     motion_frames: FramesOrNone = setting(
         48, "frames of a motion that was never filmed (arms up, head turned); 0: without it"
+    )
+
+    interactive: bool = setting(
+        True,
+        "the avatar itself in report.html and avatar.html, to be turned and posed: 1 to 4 MB each",
     )
 
     @property

@@ -116,7 +116,7 @@ def bounds(metric: str) -> tuple[float, float]:
     """The least and the largest value that a metric can have, which a stretched interval knows nothing of."""
     if metric in ("identity_found", "unseen_share"):
         return 0.0, 1.0
-    if metric.startswith(("ssim", "identity_cosine")):
+    if metric.startswith(("ssim", "identity_cosine", "arcface_cosine")):
         return -1.0, 1.0
     return (-math.inf, PSNR_CAP) if metric.startswith("psnr") else (0.0, math.inf)
 

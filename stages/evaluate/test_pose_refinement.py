@@ -9,7 +9,7 @@ them. The method that shows the refined poses is an ``AvatarMethod`` of the name
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -17,13 +17,13 @@ from torch import Tensor
 
 from pipeline.body import Pose, Poses, write_poses
 from pipeline.clip.composite import BACKGROUNDS, over
-from pipeline.clip.plan import Plan
-from pipeline.config.evaluation_protocol import ON, PLAN
 from pipeline.metrics.ssim import rounded_gaussian_window, ssim_loss
 from pipeline.splat import render
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import Animate
-from stages.evaluate.settings import EvaluateSettings
+
+PictureLoss = Callable[[Tensor, Tensor], Tensor]
+"""A scalar of two images, [H, W, 3] each."""
 
 EFFECT = "test_time_refinement"  # the plan's name of it
 
@@ -50,16 +50,16 @@ class RefinedTestPoses:
 NOT_REFINED = RefinedTestPoses({}, (), 0)
 
 
-def is_called_for(settings: EvaluateSettings, plan: Plan) -> bool:
-    """True where test poses are refined: as the protocol or a setting says, else as the plan does."""
-    asked = settings.choices.refine_test_poses
-    return plan.on(EFFECT) if asked == PLAN else asked == ON
-
-
 def refine(
-    clip: EvaluatedClip, animate: Animate, background: str, steps: int, advance: Callable[[], object]
+    clip: EvaluatedClip,
+    animate: Animate,
+    background: str,
+    steps: int,
+    advance: Callable[[], object],
+    perceptual: PictureLoss | None = None,
+    frames: Sequence[int] | None = None,
 ) -> RefinedTestPoses:
-    """Refines the pose of every held-out frame.
+    """Refines the poses of held-out frames.
 
     Args:
         clip: the clip.
@@ -67,12 +67,14 @@ def refine(
         background: what both images are composited on.
         steps: a frame.
         advance: called after each frame.
+        perceptual: a further loss of two images, weighted; the paper's L_lpips.
+        frames: which of them; all by default.
     """
     poses: dict[int, Pose] = {}
     stopped = []
-    for frame in clip.split.test:
+    for frame in clip.split.test if frames is None else frames:
         fitted = clip.pose(frame)
-        refined = refined_pose(frame_loss(clip, animate, background, frame), fitted, steps)
+        refined = refined_pose(frame_loss(clip, animate, background, frame, perceptual), fitted, steps)
         if refined is None:
             stopped.append(frame)
         poses[frame] = refined or fitted
@@ -81,7 +83,11 @@ def refine(
 
 
 def frame_loss(
-    clip: EvaluatedClip, animate: Animate, background: str, frame: int
+    clip: EvaluatedClip,
+    animate: Animate,
+    background: str,
+    frame: int,
+    perceptual: PictureLoss | None = None,
 ) -> Callable[[Pose], Tensor]:
     """The image loss of a frame as a function of its pose."""
     camera, seconds = clip.camera(frame), clip.seconds.get(frame)
@@ -90,7 +96,8 @@ def frame_loss(
     def loss(pose: Pose) -> Tensor:
         rendering = render(animate(pose, seconds), camera)
         image = over(rendering.color, rendering.alpha, background)
-        return image_loss(image, truth.to(image), BACKGROUNDS[background])
+        plain = image_loss(image, truth.to(image), BACKGROUNDS[background])
+        return plain if perceptual is None else plain + perceptual(image, truth.to(image))
 
     return loss
 

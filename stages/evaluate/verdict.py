@@ -17,6 +17,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.clip.fit_quality import FitQuality
 from pipeline.clip.plan import AZIMUTH_STEP
 from stages.evaluate.methods import AVATAR, BASELINES, CEILING, MESH, NEAREST, REFINED
 from stages.evaluate.scores import HELD_OUT, TRAINING
@@ -40,15 +41,17 @@ class ClipCoverage:
         unmodelled: the share of the body's vertices that carry no Gaussians.
         azimuths: degrees of the directions from which no training frame saw the person; 0 is its front.
         fit_pixels: mean reprojection error of the fit on trusted keypoints; None where not known.
+        quality: how well the fit says that it is on the person; None where not known.
     """
 
     unmodelled: float
     azimuths: tuple[float, ...]
     fit_pixels: float | None
+    quality: FitQuality | None = None
 
 
 def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
-    """Two to four sentences.
+    """Two to five sentences.
 
     Args:
         summary: what ``summary.json`` holds.
@@ -57,6 +60,7 @@ def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
     return [
         sentence
         for sentence in (
+            off_the_person(coverage),
             quality(summary),
             limits(summary, coverage),
             turned(coverage),
@@ -64,6 +68,20 @@ def verdict(summary: Mapping[str, Any], coverage: ClipCoverage) -> list[str]:
         )
         if sentence
     ]
+
+
+def off_the_person(coverage: ClipCoverage) -> str:
+    """The sentence on frames in which the body is not on the person; empty where there are none."""
+    fit = coverage.quality
+    if fit is None or bool(fit.passed.all()):
+        return ""
+    failed, total = int((~fit.passed).sum()), len(fit.frames)
+    if bool((~fit.passed & fit.accepted).any()):
+        return (
+            f"The fitted body is not on the person in {failed} of {total} frames, used all the same "
+            f"(fit.accept=any), so nothing below says much: {fit.figures()}."
+        )
+    return f"{failed} of {total} frames were left out: the fitted body is not on the person there."
 
 
 def quality(summary: Mapping[str, Any]) -> str:
@@ -94,12 +112,21 @@ def limits(summary: Mapping[str, Any], coverage: ClipCoverage) -> str:
     """The causes that take the most decibels."""
     found = causes(summary)
     worth = sorted(((cost, text) for cost, text in found if cost >= CLEAR), reverse=True)[:NAMED]
-    fit = f" The fit is off by {coverage.fit_pixels:.1f} px." if coverage.fit_pixels is not None else ""
+    fit = fit_sentence(coverage)
     if worth:
         return f"What limits it most: {'; then '.join(text for _, text in worth)}.{fit}"
     ceiling = summary["means"].get(HELD_OUT, {}).get(CEILING, {}).get("psnr")
     allowed = f"; masks would allow {ceiling:.1f} dB" if ceiling is not None else ""
     return f"No single limit stands out{allowed}.{fit}" if found else fit.strip()
+
+
+def fit_sentence(coverage: ClipCoverage) -> str:
+    """The sentence on how far the fit is off; begins with a space, empty where it is not known."""
+    if coverage.fit_pixels is None:
+        return ""
+    used = coverage.quality and coverage.quality.of(coverage.quality.frames[coverage.quality.accepted])
+    judged = f": in the median frame {used.figures()}" if used else ""
+    return f" The fit is off by {coverage.fit_pixels:.1f} px{judged}."
 
 
 def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
@@ -114,9 +141,9 @@ def causes(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
         text = f"masks (the truth itself scores {ceiling:.1f} dB under a second mask)"
         # A score at the ceiling can hardly rise, whatever else is mended.
         found.append((100.0 if margin < NEAR_CEILING else 0.0, text))
-    refined = means.get(REFINED, {}).get("psnr")
-    if refined is not None:
-        found.append((refined - avatar, f"poses (refining them gains {refined - avatar:.1f} dB)"))
+    gain = summary["differences"].get(REFINED, {}).get("psnr")  # on the frames that were refined
+    if gain is not None:
+        found.append((-gain["mean"], f"poses (refining them gains {-gain['mean']:.1f} dB)"))
     trained = summary["means"].get(TRAINING, {}).get(AVATAR, {}).get("psnr")
     if trained is not None:
         text = f"new frames ({trained - avatar:.1f} dB below those it learnt from)"

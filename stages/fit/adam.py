@@ -40,7 +40,7 @@ _POINTS = 16  # of the curve
 REMEDY = "look at the keypoints and cameras, or try a smaller fit.learning_rate; nothing is published"
 _NAMED = 5  # frames that a message names
 BUMPS = ((0.0, 6.0), (0.3, 3.0), (0.6, 1.5), (0.85, 0.0))
-"""From which share of the iterations on steps have which width in time: standard deviation in frames."""
+"""From which share of the iterations on steps have which width in time: in 30ths of a second."""
 
 
 StepCallback = Callable[[int, float, Callable[[], Parameters]], None]
@@ -107,8 +107,8 @@ def stepped(
 
     Args:
         base, steps: of the whole clip.
-        times: [T], in frames.
-        width: of the bumps that spread the steps, in frames.
+        times: [T], in the units of :mod:`pipeline.clip.clock`.
+        width: of the bumps that spread the steps, in the same units.
         window: the frames that are posed.
 
     Returns:

@@ -13,10 +13,17 @@ PALM = (0, 5, 9, 13, 17)
 _PALM_BONES = tuple((0, knuckle) for knuckle in PALM[1:])
 _FINGER_BONES = tuple((a, a + 1) for first in PALM[1:] for a in range(first, first + 3))
 _LEAST_POINTS = 5  # of a hand; the rest may lie outside the picture
+_APART = 12.0  # 30ths of a second between the frames before and after a leap
 _LEAST_BONES = 6  # of the fingers' twelve, for what they measure to tell a collapsed hand
 
 
-def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, threshold: float) -> np.ndarray:
+def trusted_hands(
+    hands: np.ndarray,
+    pose: np.ndarray,
+    world: np.ndarray,
+    threshold: float,
+    times: np.ndarray | None = None,
+) -> np.ndarray:
     """The hands to trust among detections that have depth; detectors give no score that tells.
 
     A hand at the picture's edge has places for the points inside alone, and they are as good as those of
@@ -33,10 +40,12 @@ def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, thresh
         pose: [T, 33, 4], x, y, z in pixels and visibility.
         world: [T, 33, 4], metres, z away from the camera, and visibility.
         threshold: tau.
+        times: [T], in 30ths of a second; by default the frames follow one another so.
 
     Returns:
         [T, 2] bool.
     """
+    times = np.arange(float(len(hands))) if times is None else times
     known = (hands[..., 3] >= threshold) & (hands[..., 3] > 0)
     seen = (known.sum(2) >= _LEAST_POINTS) & np.isfinite(hands).all((2, 3))
     trusted = seen.copy()
@@ -50,7 +59,7 @@ def trusted_hands(hands: np.ndarray, pose: np.ndarray, world: np.ndarray, thresh
         away = _distance(places[:, side, :, :2], pose[:, wrist, :2])
         trusted[:, side] &= ~(away >= 2.0 * usual + 4) | (pose[:, wrist, 3] < threshold)
         middle, somewhere = _middle(places[:, side, PALM, :2])
-        trusted[:, side] &= ~_leaps(middle, trusted[:, side] & somewhere, 1.5 * usual)
+        trusted[:, side] &= ~_leaps(middle, trusted[:, side] & somewhere, 1.5 * usual, times)
     double = trusted.all(1) & (_overlap(places[:, 0, :, :2], places[:, 1, :, :2]) > 0.5)
     farther = np.argmax(world[:, POSE_WRISTS, 2], axis=1)
     trusted[double, farther[double]] = False
@@ -148,13 +157,17 @@ def trusted_flat_hands(
     return trusted
 
 
-def _leaps(places: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
-    """Frames whose place is farther than ``limit`` from the nearest known frames before and after."""
+def _leaps(places: np.ndarray, known: np.ndarray, limit: float, times: np.ndarray) -> np.ndarray:
+    """Frames whose place is farther than ``limit`` from the nearest known frames before and after.
+
+    Where these are more than ``_APART`` apart, a hand has time to go and come back.
+    """
     leap = np.zeros(len(places), bool)
     rows = np.flatnonzero(known)
     step = np.linalg.norm(np.diff(places[rows], axis=0), axis=1)
     around = np.linalg.norm(places[rows[2:]] - places[rows[:-2]], axis=1)
-    leap[rows[1:-1]] = (step[:-1] > limit) & (step[1:] > limit) & (around < limit)
+    soon = times[rows[2:]] - times[rows[:-2]] <= _APART
+    leap[rows[1:-1]] = (step[:-1] > limit) & (step[1:] > limit) & (around < limit) & soon
     return leap
 
 

@@ -87,6 +87,7 @@ class RegistrationObjective:
         movable: Tensor,  # [55]
         settings: FitSettings,
         target: FaceTerm | None = None,
+        times: Tensor | None = None,  # [T] float64, of the frames; by default their numbers
     ) -> None:
         """Prepare what does not change during the optimisation."""
         self.target = target
@@ -97,7 +98,8 @@ class RegistrationObjective:
         self.weight = observations.mask * observations.weight
         self.saturation = torch.tensor(_SATURATION)[observations.group]
         self.scale = (LONG_SIDE / views.size.amax(1))[:, None, None]
-        self.times = (observations.frames - observations.frames[0]).float()
+        numbers = (observations.frames - observations.frames[0]).double()
+        self.times = numbers if times is None else times
         names = body.joint_names[:JAW]
         self.joint_limits = joint_limits()
         self.looked_at = torch.unique(torch.cat([self.joint_limits.joint, torch.arange(JAW, HANDS.start)]))

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pipeline.body.landmarks import Landmarks, PointSet, join
 from pipeline.clip import keypoints as coco
+from pipeline.clip.clock import times_of_numbers
 from pipeline.clip.keypoints import Keypoints
 from stages.fit.face_direction import POSE_TURNED, TURNED, mesh_facing, points_facing
 from stages.fit.hand_trust import trusted_flat_hands, trusted_hands
@@ -102,6 +103,7 @@ def observe(
     sizes: np.ndarray,
     masked: bool = True,
     facing: np.ndarray | None = None,
+    times: np.ndarray | None = None,
 ) -> Observations:
     """Choose the point sets that the estimator gave and mask what cannot be trusted.
 
@@ -111,20 +113,27 @@ def observe(
         masked: False sets m = 1 for every finite detection with a place or a score.
         facing: [T], cosine between the initial pose's face and the way to the camera, where one is
             known (``face_direction.pose_facing``); asked only where the face's points have no depth.
+        times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
     """
+    times = times_of_numbers(keypoints.frames) if times is None else times
     if (keypoints.pose_image[..., 3] > 0).any():
-        return _from_mediapipe(keypoints, landmarks, threshold, sizes, masked)
-    return _from_whole_body(keypoints, landmarks, threshold, sizes, masked, facing)
+        return _from_mediapipe(keypoints, landmarks, threshold, sizes, masked, times)
+    return _from_whole_body(keypoints, landmarks, threshold, sizes, masked, facing, times)
 
 
 def _from_mediapipe(
-    keypoints: Keypoints, landmarks: Landmarks, threshold: float, sizes: np.ndarray, masked: bool
+    keypoints: Keypoints,
+    landmarks: Landmarks,
+    threshold: float,
+    sizes: np.ndarray,
+    masked: bool,
+    times: np.ndarray,
 ) -> Observations:
     """33 pose points, 2 x 21 hand points and 478 face points."""
     sets = pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
     world, count = keypoints.pose_world, len(mesh)
     if masked:
-        pose_mask, hand_mask, face_mask = _mediapipe_masks(keypoints, threshold, sizes)
+        pose_mask, hand_mask, face_mask = _mediapipe_masks(keypoints, threshold, sizes, times)
         world_mask = world[..., 3] >= threshold
     else:
         pose_mask, hand_mask, face_mask = (detected(points) for points in sets)
@@ -148,15 +157,15 @@ def _from_mediapipe(
 
 
 def _mediapipe_masks(
-    keypoints: Keypoints, threshold: float, sizes: np.ndarray
+    keypoints: Keypoints, threshold: float, sizes: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masks of pose [T, 33], hands [T, 2, 21] and face [T, 478]."""
     pose, hands, mesh = keypoints.pose_image, keypoints.hands, keypoints.face_mesh
-    seen_hand = trusted_hands(hands, pose, keypoints.pose_world, threshold)
+    seen_hand = trusted_hands(hands, pose, keypoints.pose_world, threshold, times)
     seen_face = ((mesh[..., 3] >= threshold).mean(1) > 0.5) & (mesh_facing(mesh) >= TURNED)
     pose_mask = visible(pose, threshold, sizes)
     pose_mask[:, POSE_FACE] &= ~seen_face[:, None]
-    drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES)
+    drop_guesses(pose_mask, POSE_HIPS, POSE_KNEES, times)
     hand_mask = visible(hands, threshold, sizes) & seen_hand[..., None]
     for side, (wrist, *fingers) in enumerate(POSE_OF_HAND):
         pose_mask[:, fingers] &= ~seen_hand[:, side, None]
@@ -171,10 +180,11 @@ def _from_whole_body(
     sizes: np.ndarray,
     masked: bool,
     facing: np.ndarray | None,
+    times: np.ndarray,
 ) -> Observations:
     """The 133 points of COCO-WholeBody, which have no depth."""
     points = keypoints.whole_body
-    mask = _whole_body_mask(points, threshold, sizes, facing) if masked else detected(points)
+    mask = _whole_body_mask(points, threshold, sizes, facing, times) if masked else detected(points)
     group = np.repeat([0, 3, 1, 2], [23, 68, 21, 21])
     body = np.ones(23)
     body[1:3], body[5:11], body[11:13] = 0.3, 1.5, 0.5
@@ -192,7 +202,7 @@ def _from_whole_body(
 
 
 def _whole_body_mask(
-    points: np.ndarray, threshold: float, sizes: np.ndarray, facing: np.ndarray | None
+    points: np.ndarray, threshold: float, sizes: np.ndarray, facing: np.ndarray | None, times: np.ndarray
 ) -> np.ndarray:
     """The mask of the 133 points: [T, 133]."""
     mask = visible(points, threshold, sizes)
@@ -202,7 +212,7 @@ def _whole_body_mask(
     seen_face = (mask[:, coco.FACE].mean(1) > 0.5) & looks
     mask[:, coco.FACE] &= seen_face[:, None]
     mask[:, :5] &= ~seen_face[:, None]
-    drop_guesses(mask, (11, 12), (13, 14))
+    drop_guesses(mask, (11, 12), (13, 14), times)
     hands, seen = (np.stack([a[:, coco.LEFT_HAND], a[:, coco.RIGHT_HAND]], axis=1) for a in (points, mask))
     seen_hands = trusted_flat_hands(hands, seen, points[:, 9:11], mask[:, 9:11])
     for side, hand in enumerate((coco.LEFT_HAND, coco.RIGHT_HAND)):
@@ -257,16 +267,22 @@ def detected(points: np.ndarray) -> np.ndarray:
 
 
 def drop_guesses(
-    mask: np.ndarray, doubtful: tuple[int, int], witness: tuple[int, int], reach: int = 12
+    mask: np.ndarray,
+    doubtful: tuple[int, int],
+    witness: tuple[int, int],
+    times: np.ndarray | None = None,
+    reach: float = 12.0,
 ) -> None:
-    """Mask the doubtful points (in place) where, within ``reach`` frames, a witness is seen in under 20%.
+    """Mask the doubtful points (in place) where, within ``reach``, a witness is seen in under 20%.
+
+    ``reach`` and ``times`` [T] are in 30ths of a second; without times the frames follow one another so.
 
     The hips of a seated or cropped person score well and are guesses.
     """
-    seen = mask[:, witness].any(1).astype(np.float64)
-    window = np.ones(2 * reach + 1)
-    frames = np.convolve(np.ones_like(seen), window, "full")[reach:-reach]
-    share = np.convolve(seen, window, "full")[reach:-reach] / frames
+    times = np.arange(float(len(mask))) if times is None else times
+    seen = np.concatenate([[0], np.cumsum(mask[:, witness].any(1))])
+    first, stop = np.searchsorted(times, times - reach - 1e-6), np.searchsorted(times, times + reach + 1e-6)
+    share = (seen[stop] - seen[first]) / np.maximum(stop - first, 1)
     mask[:, doubtful] &= (share >= 0.2)[:, None]
 
 

@@ -18,6 +18,7 @@ import dataclasses
 
 import numpy as np
 
+from pipeline.clip.clock import times_of_numbers, usual_step
 from pipeline.clip.keypoints import LEFT_HAND, RIGHT_HAND, Keypoints
 
 POSE_PAIRS = ((11, 12), (13, 14), (15, 16), (23, 24), (25, 26), (27, 28))
@@ -26,15 +27,19 @@ _FACE_OF_POSE = 11  # MediaPipe's first points are the head's
 
 _SCORE = 0.4  # of a point, or of both points of a pair
 _LEAST = 2  # pairs that must be seen
-_SOON = 3  # frames of the footage within which nobody turns round, or moves and is back
+_SOON = 3.1  # 30ths of a second within which nobody turns round, or moves and is back
 _NEARER = 0.3  # the swapped points' distance, of the others'
 _APART = 0.12  # least distance of left and right, of the body's extent; less is a side view
-_LONGEST = 5  # frames of a swapped stretch that is masked
+_LONGEST = 5.1  # 30ths of a second of a swapped stretch that is masked
 _FAR, _NEAR = 0.4, 0.15  # mean distance of an isolated frame from its neighbours, and of these, of the extent
 
 
-def mask_outlier_frames(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
+def mask_outlier_frames(keypoints: Keypoints, times: np.ndarray | None = None) -> tuple[Keypoints, list[int]]:
     """The detections with body and hands unseen in outlier frames, and the numbers of these frames.
+
+    Args:
+        keypoints: of T frames.
+        times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
 
     Returns:
         The detections, the same where there is no such frame, and these frames' numbers.
@@ -43,9 +48,8 @@ def mask_outlier_frames(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
     if not (points[..., 2] > 0).any():
         points, pairs = keypoints.whole_body, BODY_PAIRS
     left, right = (points[:, [pair[side] for pair in pairs]] for side in (0, 1))
-    rows = np.union1d(
-        left_right_swapped(keypoints.frames, left, right), isolated_outliers(keypoints.frames, left, right)
-    )
+    times = times_of_numbers(keypoints.frames) if times is None else times
+    rows = np.union1d(left_right_swapped(times, left, right), isolated_outliers(times, left, right))
     if not len(rows):
         return keypoints, []
     names = ("pose_image", "pose_world", "hands", "whole_body")
@@ -58,11 +62,11 @@ def mask_outlier_frames(keypoints: Keypoints) -> tuple[Keypoints, list[int]]:
     return dataclasses.replace(keypoints, **unseen), keypoints.frames[rows].tolist()
 
 
-def left_right_swapped(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def left_right_swapped(times: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The rows in which left and right are swapped: indices, increasing.
 
     Args:
-        frames: [T], frame numbers, increasing.
+        times: [T], in 30ths of a second, increasing.
         left, right: [T, P, 3], pixels and score of a body's pairs of points.
     """
     seen, usable = _seen(left, right)
@@ -71,27 +75,28 @@ def left_right_swapped(frames: np.ndarray, left: np.ndarray, right: np.ndarray) 
     stretch = np.zeros(len(usable), int)
     for place, (before, now) in enumerate(zip(usable[:-1], usable[1:], strict=True)):
         both = seen[before] & seen[now]
-        turned = both.sum() >= _LEAST and frames[now] - frames[before] <= _SOON
+        turned = both.sum() >= _LEAST and times[now] - times[before] <= _SOON
         rows = [before, now]
         turned = turned and _crossed(left[rows][:, both, :2], right[rows][:, both, :2])
         stretch[place + 1] = stretch[place] + turned
     lengths = np.bincount(stretch)
     odd = lengths[1::2].sum() > lengths[::2].sum()  # which of the two ways round is the common one
-    swapped = [number for number, length in enumerate(lengths) if number % 2 != odd and length <= _LONGEST]
+    most = _LONGEST / min(usual_step(times), _SOON)  # frames
+    swapped = [number for number, length in enumerate(lengths) if number % 2 != odd and length <= most]
     return usable[np.isin(stretch, swapped)]
 
 
-def isolated_outliers(frames: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def isolated_outliers(times: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The rows that are far from both neighbours, which are near to each other: indices, increasing.
 
     Args:
-        frames, left, right: as for ``left_right_swapped``.
+        times, left, right: as for ``left_right_swapped``.
     """
     seen, usable = _seen(left, right)
     found = []
     for before, now, after in zip(usable[:-2], usable[1:-1], usable[2:], strict=True):
         all_three = seen[before] & seen[now] & seen[after]
-        if all_three.sum() < _LEAST or frames[after] - frames[before] > _SOON:
+        if all_three.sum() < _LEAST or times[after] - times[before] > _SOON:
             continue
         body = np.concatenate([left[:, all_three, :2], right[:, all_three, :2]], axis=1)
         extent = max(_extent(body[before]), _extent(body[after]))

@@ -14,6 +14,7 @@ from pipeline.body import BodyModel, Identity, Landmarks, Poses
 from pipeline.body.eyes import eyeball, shut_expressions, with_eyeballs
 from pipeline.body.joints import LEFT_EYE, RIGHT_EYE
 from pipeline.clip.camera import Camera
+from pipeline.clip.clock import times_of_numbers
 from pipeline.clip.curves import Curve
 from pipeline.clip.frame_files import ClipFrames
 from pipeline.clip.keypoints import Keypoints
@@ -23,7 +24,7 @@ from pipeline.pose_files import InitialPoses
 from stages.fit.adam import Recorder, optimise
 from stages.fit.camera_batch import CameraBatch, stack
 from stages.fit.eyes import FittedEyes, fit_eyes
-from stages.fit.face import fit_face
+from stages.fit.face import FaceTarget, fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.initialise_from_poses import initial_facing, initial_from_files
@@ -45,7 +46,7 @@ class Registration:
         error: [T, N], reprojection error in pixels of the stored frames, NaN where masked.
         curve: loss and reprojection error over the steps.
         seconds: (step, seconds since the start) at the curve's points.
-        face_frames: in how many frames a face was fitted first; 0 where none was.
+        face_frames: in how many frames a face was fitted first, or an expression was given; 0 in none.
         eyes: lids and gaze, which the poses hold already; None where no eye was seen.
     """
 
@@ -70,6 +71,7 @@ def register(
     start: InitialPoses | None = None,
     log: Callable[[str], None] = lambda note: None,
     source: ClipFrames | None = None,
+    times: np.ndarray | None = None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -79,15 +81,21 @@ def register(
         start: poses of the same frames to start from; None starts from the estimator's landmarks.
         log: told in a line each what else a user should know.
         source: all frames of the footage, which names of given files mean.
+        times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
     """
+    directions = body.expression_directions[..., : settings.expressions]
+    body = dataclasses.replace(body, expression_directions=directions)
     views = views_of(keypoints, cameras)
-    keypoints = _without_outlier_frames(keypoints, log) if settings.masked else keypoints
+    times = times_of_numbers(keypoints.frames) if times is None else times
+    keypoints = _without_outlier_frames(keypoints, times, log) if settings.masked else keypoints
     size = views.size.numpy()
     facing = None if start is None else initial_facing(start, body, views)
-    observations = observe(keypoints, landmarks, settings.score_threshold, size, settings.masked, facing)
+    observations = observe(
+        keypoints, landmarks, settings.score_threshold, size, settings.masked, facing, times
+    )
     target = fit_face(body, landmarks, keypoints, observations, views, settings, log, source)
     seen = observations.mask.any(0)
     on_face = observations.of("face") & on_skin(body, observations.points)
@@ -105,7 +113,9 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
-    objective = RegistrationObjective(body, observations, model, views, initial, movable, settings, face)
+    objective = RegistrationObjective(
+        body, observations, model, views, initial, movable, settings, face, torch.from_numpy(times)
+    )
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
@@ -118,7 +128,7 @@ def register(
         expression, rotation = eyes.applied(poses.expression, poses.rotation)
         poses = dataclasses.replace(poses, expression=expression, rotation=rotation)
     error = objective.residuals(fitted)
-    seconds, registered = tuple(recorder.seconds), 0 if target is None else int(target.valid.sum())
+    seconds, registered = tuple(recorder.seconds), registered_faces(settings, target, start)
     return Registration(identity, poses, observations, error, recorder.curve, seconds, registered, eyes)
 
 
@@ -144,9 +154,17 @@ def _fit_eyes(
         return fit_eyes(model, observations, objective.views, fitted, matrices, shut, weights)
 
 
-def _without_outlier_frames(keypoints: Keypoints, log: Callable[[str], None]) -> Keypoints:
+def registered_faces(settings: FitSettings, target: FaceTarget | None, start: InitialPoses | None) -> int:
+    """The number of frames whose face is registered: fitted first, or with the expression that was given."""
+    if target is not None:
+        return int(target.valid.sum())
+    given = start is not None and start.expression is not None and settings.face != "off"
+    return int(start.valid.sum()) if given and start is not None else 0
+
+
+def _without_outlier_frames(keypoints: Keypoints, times: np.ndarray, log: Callable[[str], None]) -> Keypoints:
     """The detections with outlier frames masked, see ``outlier_frames.py``; the log names these frames."""
-    keypoints, outliers = mask_outlier_frames(keypoints)
+    keypoints, outliers = mask_outlier_frames(keypoints, times)
     if outliers:
         log(
             f"frame {', '.join(map(str, outliers))}: left and right are exchanged, or the points are nowhere "

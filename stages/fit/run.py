@@ -23,6 +23,8 @@ from pipeline.body import (
     write_poses,
 )
 from pipeline.clip.camera import Camera
+from pipeline.clip.clock import frame_times
+from pipeline.clip.fit_quality import write_fit_quality
 from pipeline.clip.frames import spread_end_to_end, write_png, write_video
 from pipeline.clip.keypoints import read_keypoints
 from pipeline.clip.records import read_cameras, read_footage
@@ -31,12 +33,13 @@ from pipeline.files.tables import write_table
 from pipeline.numba_kernels import threads
 from pipeline.pose_files import read_hand_mean, write_peer_files
 from pipeline.run.stage import Context
+from stages.fit import judge
 from stages.fit.initialise_from_poses import given_poses, keep_given
 from stages.fit.observations import GROUPS, Observations
 from stages.fit.overlay import SHEET_FRAMES, overlays, sheet
 from stages.fit.registration import Registration, register, views_of
 from stages.fit.settings import FitSettings
-from stages.fit.smoothing import smooth
+from stages.fit.smoothing import smooth, window_of
 
 RESIDUALS_SCHEMA = pa.schema(
     [("frame", pa.int32()), ("group", pa.string()), ("point", pa.int32()), ("pixels", pa.float32())]
@@ -59,14 +62,17 @@ def _run(context: Context) -> None:
     context.timing("registration_seconds", round(time.monotonic() - start, 2))
     context.timing("registration_cpu_seconds", round(time.process_time() - cpu, 2))
     context.timing("curve_seconds", [[step, round(at, 3)] for step, at in fitted.seconds])
+    times = frame_times(fitted.poses.frames, read_footage(ingest / "footage.json"))
+    smoothed = published_poses(fitted, context.settings, times)
+    judge_fit(context, body, fitted, smoothed, cameras)
     means = group_means(fitted.error, fitted.observations)
     summary = ", ".join(f"{name} {mean:.2f} px" for name, mean in means.items())
     context.log(f"reprojection: {summary or 'no keypoint was trusted in any frame'}")
     write_identity(context.output / "identity.safetensors", fitted.identity, body)
-    smoothed = published_poses(fitted, context.settings)
     write_motion(context, body, fitted, smoothed, cameras)
     write_residuals(context.output / "residuals.parquet", fitted.error, fitted.observations)
-    registered = {"source": context.settings.face, "frames": len(smoothed), "registered": fitted.face_frames}
+    source = "given" if context.settings.given == "keep" else context.settings.face
+    registered = {"source": source, "frames": len(smoothed), "registered": fitted.face_frames}
     write_json(context.output / "face.json", registered)  # what the plan says of face registration
     fitted.curve.write(context.output / "curve.parquet")
     write_template(context.output / "template.ply", body, fitted.identity)
@@ -75,11 +81,11 @@ def _run(context: Context) -> None:
     context.timing("overlay_seconds", round(time.monotonic() - start, 2))
 
 
-def published_poses(fitted: Registration, settings: FitSettings) -> Poses:
+def published_poses(fitted: Registration, settings: FitSettings, times: np.ndarray) -> Poses:
     """The poses that are published: smoothed, but for eyes, steadied on their own, and for kept poses."""
     if settings.given == "keep":
         return fitted.poses
-    smoothed = smooth(fitted.poses, settings.smoothing_window)
+    smoothed = smooth(fitted.poses, window_of(settings.smoothing_seconds, times), times=times)
     if fitted.eyes is None:
         return smoothed
     expression, rotation = fitted.eyes.applied(smoothed.expression, smoothed.rotation)
@@ -103,9 +109,50 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
         def report(note: str) -> None:
             progress.advance(1, note)
 
-        source = read_footage(ingest / "footage.json").all_frames
-        fitted = register(body, landmarks, keypoints, cameras, settings, report, initial, context.log, source)
-    return fitted if kept is None else dataclasses.replace(fitted, identity=kept[0], poses=kept[1])
+        footage = read_footage(ingest / "footage.json")
+        times = frame_times(keypoints.frames, footage)
+        fitted = register(
+            body,
+            landmarks,
+            keypoints,
+            cameras,
+            settings,
+            report,
+            initial,
+            context.log,
+            footage.all_frames,
+            times,
+        )
+    if kept is None:
+        return fitted
+    identity, poses = kept  # whose face is as registered as the rest of it
+    return dataclasses.replace(fitted, identity=identity, poses=poses, face_frames=int(poses.valid.sum()))
+
+
+def judge_fit(
+    context: Context, body: BodyModel, fitted: Registration, smoothed: Poses, cameras: Mapping[int, Camera]
+) -> None:
+    """Write ``fit_quality.parquet``; the log names the frames that are left out.
+
+    Raises:
+        UserError: too many frames fail; see ``judge.decide``.
+    """
+    settings, ingest = context.settings, context.inputs["ingest"]
+    keypoints, start = read_keypoints(ingest / "keypoints.parquet"), time.monotonic()
+    error = None if settings.given == "keep" else fitted.error  # poses that are kept were not fitted
+    with context.progress(len(smoothed), "judging the fit") as progress:
+        quality = judge.measure_fit(
+            body, fitted.identity, smoothed, keypoints, cameras, error, ingest / "masks",
+            settings.score_threshold, progress.advance,
+        )  # fmt: skip
+    context.timing("judge_seconds", round(time.monotonic() - start, 2))
+    turned = judge.turned_faces(keypoints, settings.score_threshold)
+    name = read_footage(ingest / "footage.json").name
+    quality, note = judge.decide(quality, name, turned, settings.accept == "any")
+    context.log(f"judged: {quality.figures()}")
+    if note:
+        context.log(note)
+    write_fit_quality(context.output, quality)
 
 
 def write_motion(

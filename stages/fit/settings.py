@@ -13,7 +13,7 @@ Steps = Annotated[int, Field(ge=0, le=1_000_000)]
 Coefficients = Annotated[int, Field(ge=1, le=1000)]
 Factor = Annotated[float, Field(gt=0, le=1000)]
 FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
-Window = Annotated[int, Field(ge=0, le=1001)]
+Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 @dataclass(frozen=True, config=SETTINGS)
@@ -28,6 +28,7 @@ class FitSettings:
     masked: bool = setting(True, "m of Eq. 2; false trusts every detection, also outside the picture")
     score_threshold: Fraction = setting(0.4, "tau: keypoints that score less are masked (Eq. 2)")
     betas: Coefficients = setting(100, "shape coefficients, as many of these as the body has")
+    expressions: Coefficients = setting(1000, "coefficients of the expression, likewise; the paper has 50")
     joint_offsets: bool = setting(True, "fit Delta J")
     face_offsets: bool = setting(True, "fit Delta V_face, where the face is seen")
     lambda_init: Weight = setting(0.1, "weight of staying near the initial pose (Eq. 1)")
@@ -39,10 +40,14 @@ class FitSettings:
 
     # Where it starts
     face: Literal["auto", "mesh", "flame", "off"] = setting(
-        "auto", "the face that is fitted first: the estimator's mesh, FLAME's, none, or as there is"
+        "auto", "the face that is fitted first: the estimator's (its mesh, or its 68 points), FLAME's, none"
     )
     face_init: str = setting("", "folder of DECA's flame_params/ and shape_param.json, for face=flame")
     flame_model: str = setting("", "FLAME model file of the user's own, for face=flame")
+    flame_fit: bool = setting(
+        False, "fit FLAME to the 2D face points first (supplement A), for face=flame; face_init is its start"
+    )
+    lambda_flame_init: Weight = setting(0.1, "weight of its distance from DECA's start")
     pose_init: str = setting(
         "", "folder of SMPLest-X poses, smplx_init/*.json; else the estimator's landmarks"
     )
@@ -54,8 +59,13 @@ class FitSettings:
     )
 
     # What is published
-    smoothing_window: Window = setting(
-        5, "frames of the Savitzky-Golay filter, odd, from 3; 0 leaves the poses as fitted"
+    accept: Literal["good", "any"] = setting(
+        "good",
+        "good: leave out frames whose body is not on the person, and refuse a clip of such; any: go on",
+    )
+    smoothing_seconds: Seconds = setting(
+        0.18,
+        "length of the Savitzky-Golay filter: 5 frames of 25 or 30 a second; 0 leaves the poses as fitted",
     )
     export_peers: bool = setting(
         False, "write identity and poses in ExAvatar's and FlexiAvatar's JSON layout too"
@@ -64,11 +74,8 @@ class FitSettings:
 
     @model_validator(mode="after")
     def _fit_together(self) -> FitSettings:
-        window = self.smoothing_window
-        if window and (window < 3 or window % 2 == 0):
-            raise ValueError(f"fit.smoothing_window must be 0 or odd, from 3, not {window}")
-        if self.face == "flame" and not (self.face_init and self.flame_model):
-            raise ValueError("fit.face=flame needs fit.face_init and fit.flame_model")
+        if self.face == "flame" and not (self.flame_model and (self.face_init or self.flame_fit)):
+            raise ValueError("fit.face=flame needs fit.flame_model, and fit.face_init or fit.flame_fit=true")
         if self.face != "flame" and (self.face_init or self.flame_model):
             raise ValueError("fit.face_init and fit.flame_model are not used: set fit.face=flame")
         return self

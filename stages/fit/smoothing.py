@@ -19,9 +19,21 @@ import torch
 from torch import Tensor
 
 from pipeline.body import Poses
+from pipeline.clip.clock import RATE, usual_step
 
 
-def smooth(poses: Poses, window: int, order: int = 2) -> Poses:
+def window_of(seconds: float, times: np.ndarray) -> int:
+    """The odd number of a clip's usual frames that is nearest to some seconds; 0 for fewer than two.
+
+    Args:
+        seconds: the window's length.
+        times: [T], of the frames, in the units of :mod:`pipeline.clip.clock`.
+    """
+    half = math.ceil((seconds * RATE / usual_step(times) - 1) / 2 - 0.5 - 1e-6)
+    return 2 * half + 1 if half > 0 else 0
+
+
+def smooth(poses: Poses, window: int, order: int = 2, times: np.ndarray | None = None) -> Poses:
     """The poses with rotation, expression and translation smoothed over time.
 
     Only frames that were measured (``poses.valid``) are fitted to. Between them the others take the
@@ -36,6 +48,7 @@ def smooth(poses: Poses, window: int, order: int = 2) -> Poses:
         poses: T frames.
         window: how many frames the polynomial sees, odd; 0 leaves the poses as they are.
         order: the polynomial's degree.
+        times: [T], of the frames, increasing, see :mod:`pipeline.clip.clock`; by default their numbers.
 
     Returns:
         Poses of the same frames. Rotation vectors are on the branch nearest to those given.
@@ -50,7 +63,8 @@ def smooth(poses: Poses, window: int, order: int = 2) -> Poses:
     measured = poses.valid.cpu().numpy()
     if not measured.any():
         return poses
-    local = _Filter(np.array(poses.frames, np.float64), measured, window, order)
+    times = np.array(poses.frames, np.float64) if times is None else times
+    local = _Filter(times, measured, window, order)
     quaternions = _same_sign(roma.rotvec_to_unitquat(poses.rotation.double()), poses.valid)
     turned = roma.quat_normalize(local.applied(quaternions))
     return dataclasses.replace(
@@ -84,14 +98,14 @@ class _Filter:
         """Prepare the weights.
 
         Args:
-            times: [T], frame numbers, increasing.
+            times: [T], increasing.
             measured: [T] bool, at least one of them.
             order: the polynomials' degree.
         """
         self.rows = np.flatnonzero(measured)
         known = times[self.rows]
         # Half a window; a clip of which every other frame was kept is seen as evenly spaced.
-        reach = (window // 2) * float(np.median(np.diff(known))) if len(known) > 1 else 1.0
+        reach = (window // 2) * usual_step(known) if len(known) > 1 else 1.0
         first, last = _runs(known, reach)
         before = np.searchsorted(known, times, side="right") - 1
         after = np.searchsorted(known, times, side="left")

@@ -130,14 +130,14 @@ def joint_limit_loss(angle: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def velocity(values: Tensor, times: Tensor) -> Tensor:
-    """Differences of neighbouring frames, divided by the square root of the frames between them.
+    """Differences of neighbouring frames, divided by the square root of the time between them.
 
     Its square summed over a gap of dropped frames is what the same motion, spread evenly over the
-    missing frames, would have given.
+    missing frames, would have given, whatever the frame rate.
 
     Args:
         values: [T, ...].
-        times: [T], increasing, in frames.
+        times: [T], increasing, in 30ths of a second.
 
     Returns:
         [T - 1, ...]; empty for one frame.
@@ -147,11 +147,11 @@ def velocity(values: Tensor, times: Tensor) -> Tensor:
 
 
 def acceleration(values: Tensor, times: Tensor) -> Tensor:
-    """Second difference a frame squared; x[t+1] - 2 x[t] + x[t-1] where no frame is missing.
+    """Second difference a 30th of a second squared; x[t+1] - 2 x[t] + x[t-1] at that rate.
 
     Args:
         values: [T, ...].
-        times: [T], increasing, in frames.
+        times: [T], increasing, in 30ths of a second.
 
     Returns:
         [T - 2, ...]; empty for fewer than three frames.

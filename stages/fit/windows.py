@@ -60,8 +60,8 @@ def bumps(times: Tensor, width: float, low: int = 0, high: int | None = None) ->
     A step spreads over time as a Gaussian that ends at three standard deviations.
 
     Args:
-        times: [T], increasing, in frames.
-        width: standard deviation in frames; 0 moves each frame alone.
+        times: [T], increasing, in the units of :mod:`pipeline.clip.clock`.
+        width: standard deviation in the same; 0 moves each frame alone.
         low, high: the frames that move; all by default.
 
     Returns:
@@ -74,5 +74,5 @@ def bumps(times: Tensor, width: float, low: int = 0, high: int | None = None) ->
     first = int(torch.searchsorted(times, times[low] - reach))
     last = int(torch.searchsorted(times, times[high - 1] + reach, right=True))
     away = times[low:high, None] - times[first:last]
-    weight = torch.exp(-away.square() / (2 * width**2)) * (away.abs() <= reach)
+    weight = torch.exp(-away.float().square() / (2 * width**2)) * (away.abs() <= reach)
     return weight / weight.sum(1, keepdim=True), first, last

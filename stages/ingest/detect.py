@@ -1,15 +1,17 @@
-"""The passes over the footage: the people in it, then landmarks and masks of the chosen one."""
+"""The second pass over the footage: landmarks and masks of the chosen person."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from pipeline.clip.boxes import Box
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints, empty_keypoints
 from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
@@ -20,16 +22,18 @@ from stages.ingest.keypoint_check import OFF_FRAME, Agreement, check_agreement, 
 from stages.ingest.mask_files import read_given_mask
 from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
-from stages.ingest.settings import IngestSettings
+from stages.ingest.people_search import NATIVE_LOG, expected_frames, search_people
+from stages.ingest.person_detector import Person
+from stages.ingest.stills import are_stills, detects_singly
 from stages.ingest.video import Clip, SourceFrame, missing_frames, read_clip
 
 if TYPE_CHECKING:
     from pipeline.run.stage import Context
 
-SEARCHES_A_SECOND = 5  # for people
-NATIVE_LOG = "mediapipe.log"
 BEST_POINTS = 5  # a person is there when this many body points are
 OFF_MASK = "keypoints off the mask"
+OTHER_SHOT, ABSENT = "another shot", "another person"
+NEIGHBOURHOOD = 1.5  # of a person's radius about the hips: what the estimator is shown where others are about
 MOST_COMPARED = 32  # frames whose masks are kept, to tell how given keypoints fail
 
 
@@ -45,6 +49,8 @@ class DetectedClip:
         read: how many frames were looked at.
         dropped: reason -> frames.
         people: how many people there are at once; 0 where nobody counted.
+        stills: whether the frames are single pictures, see ``stills.py``.
+        subject: the person who was followed; None where nobody searched.
     """
 
     keypoints: Keypoints
@@ -55,6 +61,8 @@ class DetectedClip:
     read: int
     dropped: dict[str, int]
     people: int
+    stills: bool = False
+    subject: people.Track | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,10 +85,16 @@ class FrameDetector:
     """Detects the chosen person in one frame after the other."""
 
     def __init__(
-        self, context: Context, clip: Clip, sources: DetectionSources, found: people.ClipPeople
+        self,
+        context: Context,
+        clip: Clip,
+        sources: DetectionSources,
+        found: people.ClipPeople,
+        singly: bool = False,
     ) -> None:
-        """Load the estimator if the sources need it."""
+        """Load the estimator if the sources need it; ``singly``: it looks at each frame by itself."""
         self.settings, self.clip, self.sources, self.people = context.settings, clip, sources, found
+        singly = singly or bool(found.others)  # a crop that moves cannot be followed
         self.scale = min(1.0, self.settings.long_side / max(clip.width, clip.height))
         self.width, self.height = (max(1, round(side * self.scale)) for side in (clip.width, clip.height))
         self.size = np.array([self.width, self.height], np.float32)
@@ -89,11 +103,13 @@ class FrameDetector:
         )
         self.estimator = None
         if sources.mediapipe is not None:
-            self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG)
+            self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG, singly)
         self.agreements: list[Agreement] = []
 
     def detect_frame(self, picture: SourceFrame) -> FrameDetections | str:
         """The person in a frame, or the reason why the frame is dropped."""
+        if self.people.absent(picture.index):
+            return ABSENT
         own = people.subject_region(picture.index, self.people, self.clip.width, self.clip.height)
         estimate = self._estimate(picture, own)
         if self.sources.keypoints is not None:
@@ -142,7 +158,24 @@ class FrameDetector:
     def _estimate(self, picture: SourceFrame, own: np.ndarray | None) -> Estimate | None:
         if self.estimator is None:
             return None
-        return self.estimator.estimate(resize(people.hide_others(picture.image, own), self.estimator_scale))
+        shown = people.hide_others(picture.image, own)
+        if self.people.subject is None or not self.people.others:
+            return self.estimator.estimate(resize(shown, self.estimator_scale))
+        box = self._neighbourhood(self.people.subject.at(picture.index))
+        part = np.ascontiguousarray(shown[box.top : box.bottom, box.left : box.right])
+        scale = estimator_scale(
+            box.width, box.height, self.settings.estimator_short_side, self.settings.estimator_long_side
+        )
+        estimate = self.estimator.estimate(resize(part, scale))
+        return None if estimate is None else estimate.placed(box, self.clip.width, self.clip.height)
+
+    def _neighbourhood(self, subject: Person) -> Box:
+        """The square about the subject that the estimator is shown; inside the picture."""
+        size = np.array([self.clip.width, self.clip.height])
+        reach = NEIGHBOURHOOD * subject.radius
+        low = np.clip(np.floor(subject.hips - reach), 0, size - 16).astype(int)
+        high = np.clip(np.ceil(subject.hips + reach), low + 16, size).astype(int)
+        return Box(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
     def _masks(
         self, picture: SourceFrame, estimate: Estimate | None, own: np.ndarray | None
@@ -173,43 +206,41 @@ class FrameDetector:
         return tuple(masks)
 
 
-def count_people(context: Context, clip: Clip, sources: DetectionSources) -> tuple[people.ClipPeople, int]:
-    """The people found in some frames of a clip, and how many frames it has (0: unknown)."""
-    settings = context.settings
-    if sources.mediapipe is None:
-        return people.ClipPeople(None, (), 0), 0
-    detector = people.PersonDetector(sources.mediapipe, context.work / NATIVE_LOG)
-    every = max(1, round((clip.fps or SEARCHES_A_SECOND) / settings.stride / SEARCHES_A_SECOND))
-    found, total = [], 0
-    with context.progress(_expected(clip, settings), "people") as progress:
-        for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
-            if total % every == 0 and not picture.damaged:
-                found.append((picture.index, detector.detect(picture.image)))
-            total += 1
-            progress.advance()
-    everyone = people.track_people(found, clip.width, clip.height)
-    if everyone.count > 1:
-        context.log(f"{everyone.count} people at once: the largest and most central one is kept")
-    return everyone, total
-
-
-def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: Path) -> DetectedClip:
+def detect(
+    context: Context,
+    clip: Clip,
+    sources: DetectionSources,
+    raw_masks: Path,
+    choose: Callable[[Sequence[people.Track]], people.Track] | None = None,
+) -> DetectedClip:
     """Detect the person in every frame; write kept frames to ``output/frames``, raw masks to ``raw_masks``.
+
+    Args:
+        choose: finds the subject of a rig's first camera among the people of this one.
 
     Raises:
         UserError: a damaged frame, or a keypoint or mask file that is damaged or of no frame.
     """
     settings = context.settings
-    everyone, total = count_people(context, clip, sources)
+    stills = are_stills(clip, settings)
+    search = search_people(context, clip, sources, stills, choose)
+    everyone, total = search.everyone, search.total
     sources = with_mask_form(context, clip, sources)
-    detector = FrameDetector(context, clip, sources, everyone)
+    singly = detects_singly(clip, settings, stills)
+    if singly and sources.mediapipe is not None:
+        kind = "pictures do not follow one another" if stills else "frames lie far apart in time"
+        context.log(f"{clip.path.name}: its {kind}: each is detected by itself")
+    detector = FrameDetector(context, clip, sources, everyone, singly)
     kept: list[tuple[int, float, FrameDetections]] = []
     dropped: Counter[str] = Counter()
     numbers: set[int] = set()
-    with context.progress(total or _expected(clip, settings), "frames") as progress:
+    with context.progress(total or expected_frames(clip, settings), "frames") as progress:
         for picture in read_clip(clip, settings.stride, settings.max_frames, settings.damaged):
             numbers.add(picture.index)
-            seen = "damaged" if picture.damaged else detector.detect_frame(picture)
+            if search.shot is not None and picture.index not in search.shot:
+                seen: FrameDetections | str = OTHER_SHOT
+            else:
+                seen = "damaged" if picture.damaged else detector.detect_frame(picture)
             if isinstance(seen, str):
                 dropped[seen] += 1
                 if seen == OFF_MASK:
@@ -233,8 +264,18 @@ def detect(context: Context, clip: Clip, sources: DetectionSources, raw_masks: P
         check_frames(sources, numbers)
     check_agreement(detector.agreements)
     seconds, dropped_for = tuple(seconds for _, seconds, _ in kept), dict(sorted(dropped.items()))
-    size = (detector.width, detector.height, detector.scale)
-    return DetectedClip(_stack(kept, detector), seconds, *size, len(numbers), dropped_for, everyone.count)
+    return DetectedClip(
+        keypoints=_stack(kept, detector),
+        seconds=seconds,
+        width=detector.width,
+        height=detector.height,
+        scale=detector.scale,
+        read=len(numbers),
+        dropped=dropped_for,
+        people=everyone.count,
+        stills=stills,
+        subject=everyone.subject,
+    )
 
 
 def _stack(kept: list[tuple[int, float, FrameDetections]], detector: FrameDetector) -> Keypoints:
@@ -248,9 +289,3 @@ def _stack(kept: list[tuple[int, float, FrameDetections]], detector: FrameDetect
         if seen.whole_body is not None:
             keypoints.whole_body[row] = seen.whole_body
     return keypoints
-
-
-def _expected(clip: Clip, settings: IngestSettings) -> int:
-    stride, limit = settings.stride, settings.max_frames
-    total = -(-clip.expected // stride)
-    return min(total, limit) if limit else total

@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipeline.clip.background import Background, learn_background
 from pipeline.clip.boxes import person_box
 from pipeline.clip.foreground import FOREGROUND
 from pipeline.clip.frames import read_frame, read_mask, write_frame
-from stages.ingest.background import Background, learn_background
 
 WIDE, NARROW = 0.12, 0.02  # of the person's longer side, the boxes' sides
 LEAST_WIDE, LEAST_NARROW = 21, 7  # pixels

@@ -4,8 +4,8 @@ The pose model's segmentation knows which body is meant and has limbs and feet, 
 selfie segmentation is sharp about heads and shoulders, but takes in furniture and other people. How
 far the two agree over the clip says how far the second can be trusted. What is known of a background
 that stands still is then taken out, the edge is moved to the picture's edges, hands and feet that the
-detector saw are completed (``mask_parts.py``), and the masks are averaged along the motion: an avatar
-cannot score higher than the masks agree with one another.
+detector saw are completed where that is asked for (``mask_parts.py``), and the masks are averaged along
+the motion: an avatar cannot score higher than the masks agree with one another.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from pipeline.clip.background import learn_background, log_odds, subtract_background
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints
-from stages.ingest.background import learn_background, log_odds, subtract_background
 from stages.ingest.mask_edges import follow_edges
 from stages.ingest.mask_parts import complete_parts
 from stages.ingest.mask_smoothing import smooth_masks

@@ -1,77 +1,31 @@
-"""The people in a clip, and the one that is kept: the largest and most central person.
+"""The people in a clip, each followed through it, and the one that is kept.
 
-Detections in some frames are linked into tracks; the track with the greatest sum of size times centrality
-is the subject's. Where others stand beside the subject, the picture is divided between the people, and the
-estimator is shown the subject's part only. The detector overlooks people who are small in the picture; the
-estimator does not mistake them for the subject either.
+Detections in some frames are linked into tracks by place, size and the colours of the torso; tracks that are
+never seen at once and look the same are one person, lost and found again. The subject is whoever fills most
+of the clip (size times centrality, added up) and moves: a picture on a wall does not change, and is passed
+over where somebody else does. ``ingest.person`` names another.
+
+Where others stand beside the subject, the picture is divided between the people, and the estimator is shown
+the subject's part only.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pipeline.detection.mediapipe import BLANK, load_mediapipe, native_errors_to
+from pipeline.errors import UserError
+from stages.ingest.person_detector import Person
 
-_GRAPH = """
-input_stream: "image"
-output_stream: "detections"
-node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
-"""
 REACH = 0.6  # how far a person may move between two searches, in torso lengths
 GROWTH = 2.0  # and grow or shrink
 PERSISTENT = 0.2  # a track seen in a smaller part of the searches is a false alarm
-
-
-@dataclasses.dataclass(frozen=True)
-class Person:
-    """One detection, in pixels.
-
-    Attributes:
-        hips: [2], the middle of the hips; may lie outside the picture.
-        shoulders: [2], the middle of the shoulders.
-        radius: of the circle about the hips that holds the whole body.
-        score: in [0, 1].
-    """
-
-    hips: np.ndarray
-    shoulders: np.ndarray
-    radius: float
-    score: float
-
-
-class PersonDetector:
-    """MediaPipe's person detector, which finds every person in a picture and follows nobody."""
-
-    def __init__(self, asset: Path, native_log: Path) -> None:
-        """Load it; arguments and errors as those of :class:`pipeline.detection.mediapipe.Estimator`."""
-        load_mediapipe(asset)
-        self._native_log = native_log
-        from google.protobuf import text_format
-
-        base = importlib.import_module("mediapipe.python.solution_base")
-        messages = importlib.import_module("mediapipe.framework.calculator_pb2")
-        graph = text_format.Parse(_GRAPH, messages.CalculatorGraphConfig())
-        with native_errors_to(native_log):
-            self._graph = base.SolutionBase(graph_config=graph, outputs=["detections"])
-            self._graph.process(BLANK)
-
-    def detect(self, image: np.ndarray) -> list[Person]:
-        """The people in ``image`` [H, W, 3] uint8 RGB; coordinates in its pixels."""
-        height, width = image.shape[:2]
-        with native_errors_to(self._native_log):
-            found = self._graph.process(image).detections or []
-        people = []
-        for detection in found:
-            points = [(p.x * width, p.y * height) for p in detection.location_data.relative_keypoints]
-            hips, rim, shoulders = (np.array(point) for point in points[:3])
-            radius = float(np.linalg.norm(rim - hips))
-            people.append(Person(hips, shoulders, radius, float(detection.score[0])))
-        return people
+LOST = 4  # searches after which a track ends
+ALIKE, STRANGE = 0.78, 0.35  # overlap of colours from which two are one person, and under which they are not
+STILL, LIVELY = 1.5, 3.0  # grey levels under which a picture hangs still; times that by which another moves
+_PICTURE = 0.02  # weight of a picture on a wall
 
 
 @dataclasses.dataclass
@@ -81,8 +35,34 @@ class Track:
     people: dict[int, Person]
 
     def at(self, frame: int) -> Person:
-        """The detection nearest in time."""
-        return self.people[min(self.people, key=lambda other: (abs(other - frame), other))]
+        """The detection, interpolated between the two nearest in time; the nearest at either end."""
+        frames = list(self.people)
+        after = int(np.searchsorted(frames, frame))
+        if after == 0 or after == len(frames) or frames[after] == frame:
+            return self.people[frames[min(after, len(frames) - 1)]]
+        first, second = self.people[frames[after - 1]], self.people[frames[after]]
+        share = (frame - frames[after - 1]) / (frames[after] - frames[after - 1])
+        between = {
+            name: (1 - share) * getattr(first, name) + share * getattr(second, name)
+            for name in ("hips", "shoulders", "radius")
+        }
+        return dataclasses.replace(first, **between)
+
+    def away(self, frame: int) -> int:
+        """How many frames lie between a frame and the nearest detection."""
+        return min(abs(frame - other) for other in self.people)
+
+    @property
+    def colors(self) -> np.ndarray | None:
+        """The mean colours of the detections that have them."""
+        known = [one.colors for one in self.people.values() if one.colors is not None]
+        return np.mean(known, axis=0) if known else None
+
+    @property
+    def change(self) -> float | None:
+        """The median change of the person's part of the picture; None where nobody looked."""
+        known = [one.change for one in self.people.values() if one.change is not None]
+        return float(np.median(known)) if known else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,56 +73,138 @@ class ClipPeople:
         subject: the kept person's track; None where nobody was found.
         others: the tracks of the rest.
         count: how many people there are at once, at most.
+        step: frames from one search to the next.
+        everyone: all people by prominence, the first is number 1 of ``ingest.person``.
+        peopled: the frames in which anybody was detected.
     """
 
     subject: Track | None
     others: tuple[Track, ...]
     count: int
+    step: int = 1
+    everyone: tuple[Track, ...] = ()
+    peopled: frozenset[int] = frozenset()
+
+    def absent(self, frame: int) -> bool:
+        """True where somebody else than the subject is seen about a frame, in a clip of several people."""
+        if self.subject is None or not self.others or self.subject.away(frame) <= 2 * self.step:
+            return False
+        return any(abs(frame - other) <= self.step for other in self.peopled)
 
 
-def track_people(found: Sequence[tuple[int, list[Person]]], width: int, height: int) -> ClipPeople:
+def track_people(
+    found: Sequence[tuple[int, list[Person]]],
+    width: int,
+    height: int,
+    number: int = 0,
+    name: str = "the clip",
+    choose: Callable[[Sequence[Track]], Track] | None = None,
+) -> ClipPeople:
     """The tracks of all people, and which of them is the subject's.
 
     Args:
         found: (frame number, the people detected in it), in order.
         width, height: the picture's size in pixels.
+        number: of the person who is meant, counted from 1 by prominence; 0 for the first.
+        name: of the clip, for messages.
+        choose: picks the subject among the people, where no number does; the most prominent by default.
+
+    Raises:
+        UserError: there is no person of that number.
     """
-    tracks = link_detections(found)
     least = max(2, round(PERSISTENT * len(found))) if len(found) > 2 else 1
-    tracks = [track for track in tracks if len(track.people) >= least]
-    if not tracks:
+    tracks = [track for track in link_detections(found) if len(track.people) >= min(2, least)]
+    people = [track for track in joined(tracks) if len(track.people) >= least]
+    if number > len(people):
+        shown = f"{len(people)} people" if len(people) != 1 else "1 person"
+        raise UserError(f"{name} shows {shown}: lower ingest.person={number}, which is none of them")
+    if not people:
         return ClipPeople(None, (), 0)
+    everyone = by_prominence(people, width, height)
+    subject = choose(everyone) if choose is not None and not number else everyone[max(number - 1, 0)]
+    count = max(sum(frame in track.people for track in people) for frame, _ in found)
+    others = tuple(track for track in everyone if track is not subject)
+    frames = [frame for frame, _ in found]
+    step = round(float(np.median(np.diff(frames)))) if len(frames) > 1 else 1
+    peopled = frozenset(frame for frame, seen in found if seen)
+    return ClipPeople(subject, others, max(count, 1), step, tuple(everyone), peopled)
+
+
+def by_prominence(people: Sequence[Track], width: int, height: int) -> list[Track]:
+    """People by size times centrality, added up over the clip; pictures on walls come last."""
 
     def weight(track: Track) -> float:
-        return sum(prominence(one, width, height) for one in track.people.values())
+        total = sum(prominence(one, width, height) for one in track.people.values())
+        return total * (_PICTURE if hangs_still(track, people) else 1.0)
 
-    subject = max(tracks, key=weight)
-    count = max(sum(frame in track.people for track in tracks) for frame, _ in found)
-    # A track that never coincides with the subject's is the subject, lost and found again.
-    others = [track for track in tracks if track is not subject and set(track.people) & set(subject.people)]
-    return ClipPeople(subject, tuple(others), max(count, 1))
+    return sorted(people, key=weight, reverse=True)
+
+
+def hangs_still(track: Track, people: Sequence[Track]) -> bool:
+    """True for a picture on a wall: it hardly changes, and somebody else in the clip changes much more."""
+    changes = [one.change for one in people if one.change is not None]
+    return track.change is not None and track.change < min(STILL, max(changes) / LIVELY)
 
 
 def link_detections(found: Sequence[tuple[int, list[Person]]]) -> list[Track]:
-    """Tracks of detections that follow one another closely, the nearest pairs first."""
+    """Tracks of detections that follow one another closely, the nearest and most alike pairs first."""
     tracks: list[Track] = []
-    for frame, people in found:
+    last_seen: list[int] = []
+    for search, (frame, people) in enumerate(found):
         last = [track.people[next(reversed(track.people))] for track in tracks]
         pairs = sorted(
-            (float(np.linalg.norm(before.shoulders - now.shoulders)), row, column)
+            (_apart(before, now), row, column)
             for row, before in enumerate(last)
             for column, now in enumerate(people)
-            if _follows(before, now)
+            if search - last_seen[row] <= LOST and _follows(before, now)
         )
         free = set(range(len(people)))
         taken: set[int] = set()
         for _, row, column in pairs:
             if row not in taken and column in free:
                 tracks[row].people[frame] = people[column]
+                last_seen[row] = search
                 taken.add(row)
                 free.discard(column)
         tracks.extend(Track({frame: people[column]}) for column in sorted(free))
+        last_seen.extend(search for _ in free)
     return tracks
+
+
+def joined(tracks: Sequence[Track]) -> list[Track]:
+    """The tracks with those made one that look alike and are never seen at once, the longest first."""
+    people: list[Track] = []
+    for track in sorted(tracks, key=lambda one: -len(one.people)):
+        alike = [(likeness(one, track), row) for row, one in enumerate(people)]
+        alike = [(value, row) for value, row in alike if value >= ALIKE and not shared(people[row], track)]
+        if alike:
+            row = max(alike)[1]
+            people[row] = Track(dict(sorted({**people[row].people, **track.people}.items())))
+        else:
+            people.append(track)
+    return people
+
+
+def shared(first: Track, second: Track) -> bool:
+    """True where two tracks have a frame in common."""
+    return not first.people.keys().isdisjoint(second.people)
+
+
+def likeness(first: Track, second: Track) -> float:
+    """The overlap of two tracks' colours, in [0, 1]; 1 where nothing is known of one of them.
+
+    Tracks of which one begins where the other ends are alike unless their colours are quite others.
+    """
+    one, other = first.colors, second.colors
+    if one is None or other is None:
+        return 1.0
+    overlap = color_overlap(one, other)
+    return max(overlap, ALIKE) if overlap >= STRANGE and _continues(first, second) else overlap
+
+
+def color_overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """Bhattacharyya's coefficient of two histograms that add up to 1: 1 for equal ones, 0 for disjoint."""
+    return float(np.sqrt(first * second).sum())
 
 
 def prominence(person: Person, width: int, height: int) -> float:
@@ -173,7 +235,25 @@ def hide_others(image: np.ndarray, own: np.ndarray | None) -> np.ndarray:
     return shown
 
 
+def _continues(first: Track, second: Track) -> bool:
+    """True where one track ends near in place to where the other begins."""
+    early, late = sorted((first, second), key=lambda track: min(track.people))
+    end, start = early.people[max(early.people)], late.people[min(late.people)]
+    return max(early.people) < min(late.people) and _follows(end, start)
+
+
+def _apart(before: Person, now: Person) -> float:
+    """The distance of two detections in the first one's size, and of their colours where both are known."""
+    away = float(np.linalg.norm(before.shoulders - now.shoulders)) / max(before.radius, 1e-6)
+    if before.colors is None or now.colors is None:
+        return away
+    return away + 1 - color_overlap(before.colors, now.colors)
+
+
 def _follows(before: Person, now: Person) -> bool:
+    if before.colors is not None and now.colors is not None:
+        if color_overlap(before.colors, now.colors) < STRANGE:
+            return False
     growth = now.radius / max(before.radius, 1e-6)
     near = float(np.linalg.norm(before.shoulders - now.shoulders)) < REACH * before.radius
     return near and 1 / GROWTH < growth < GROWTH

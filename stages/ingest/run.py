@@ -96,4 +96,5 @@ def describe(recording: Recording, found: Ingested, whole: bool) -> Footage:
         camera=found.camera_record,
         total=len(pictures) or (detected.read if whole else clip.expected),
         names={str(frame): file.name for frame, file in sorted(pictures.items())},
+        stills=detected.stills,
     )

@@ -55,6 +55,10 @@ class IngestSettings:
         -1, "the first frame's number in the names of files that are not named as the frames; -1: as they say"
     )
     poses: str = setting("", "file of poses to start from that lies elsewhere than the footage: SHOW's .pkl")
+    person: CountOrNone = setting(
+        0, "which person is kept, counted from 1 as the log lists them; 0: who fills most of it and moves"
+    )
+    shot: CountOrNone = setting(0, "which shot of a clip with cuts is taken, counted from 1; 0: the longest")
     test_fraction: TestFraction = setting(
         0.1, "the part of the kept frames, at the clip's end, that is held out"
     )
@@ -84,7 +88,7 @@ class IngestSettings:
     mask_area: Fraction = setting(0.002, "a frame whose mask covers less of the picture holds no person")
     mask_edge: Fraction = setting(1.0, "how far the mask follows the picture's own edges")
     mask_parts: bool = setting(
-        True, "complete hands and feet that the detector saw and the mask lost, by their colours"
+        False, "complete hands and feet that the detector saw and the mask lost, by their colours"
     )
     mask_steadiness: Steadiness = setting(
         2, "frames on either side that a mask is averaged with along the motion"

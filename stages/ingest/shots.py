@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shutil
 import time
 from collections import Counter
@@ -14,16 +15,18 @@ import numpy as np
 
 from pipeline.clip.camera import Camera
 from pipeline.clip.keypoints import Keypoints
+from pipeline.clip.records import SHOT_STEP
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses, on_frames
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.cameras.choose import ClipCameras, choose_cameras
 from stages.ingest.cameras.distortion import undistort_frames
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, join_poses
+from stages.ingest.datasets.recording import Recording, Shot, join_poses
 from stages.ingest.detect import DetectedClip, detect
 from stages.ingest.external_detections import open_sources
 from stages.ingest.foreground import write_foreground
 from stages.ingest.masks import publish_given_masks, refine_masks
+from stages.ingest.same_person import KnownPerson, still_camera
 from stages.ingest.video import Clip
 
 if TYPE_CHECKING:
@@ -54,7 +57,12 @@ class Ingested:
 
 
 def ingest_shot(
-    context: Context, shot: Shot, layout: str, span: range | None = None, least: int = LEAST_FRAMES
+    context: Context,
+    shot: Shot,
+    layout: str,
+    span: range | None = None,
+    least: int = LEAST_FRAMES,
+    known: KnownPerson | None = None,
 ) -> Ingested:
     """Write frames and masks of a shot, and find its keypoints and cameras.
 
@@ -64,6 +72,7 @@ def ingest_shot(
         layout: the dataset's.
         span: the frame numbers that are this shot's, where there are several.
         least: the fewest frames with a person.
+        known: the person, as the first camera of the rig saw them.
 
     Raises:
         UserError: the footage, or what came with it, cannot be used; names the file and the remedy.
@@ -78,7 +87,10 @@ def ingest_shot(
     raw_masks.mkdir(parents=True)
 
     started = time.perf_counter()
-    detected = detect(context, clip, sources, raw_masks)
+    camera, choose = still_camera(calibration), None
+    if known is not None:
+        choose = functools.partial(known.among, camera=camera, first=clip.first)
+    detected = detect(context, clip, sources, raw_masks, choose)
     check_enough(clip, detected, least)
     seen = time.perf_counter()
     if sources.masks is None:
@@ -144,16 +156,15 @@ def ingest_recording(context: Context, recording: Recording) -> Ingested:
     layout = recording.layout
     if len(recording.shots) == 1:
         return ingest_shot(context, recording.shots[0], layout)
-    parts = [
-        ingest_shot(
-            context,
-            shot,
-            layout,
-            range(place * SHOT_STEP, (place + 1) * SHOT_STEP),
-            1 if place else LEAST_FRAMES,
-        )
-        for place, shot in enumerate(recording.shots)
-    ]
+    parts: list[Ingested] = []
+    known = None
+    for place, shot in enumerate(recording.shots):
+        span, least = range(place * SHOT_STEP, (place + 1) * SHOT_STEP), 1 if place else LEAST_FRAMES
+        parts.append(ingest_shot(context, shot, layout, span, least, known))
+        subject = parts[0].detected.subject
+        if subject is not None:
+            begin = recording.shots[0]
+            known = KnownPerson(subject, still_camera(begin.calibration), begin.clip.first)
     first = parts[0]
     clips = [part.detected for part in parts]
     detected = dataclasses.replace(

@@ -137,7 +137,9 @@ def _read_video(clip: Clip, stride: int) -> Iterator[SourceFrame]:
 def _open_folder(path: Path) -> Clip:
     files = visible_files(path, PICTURES)
     if not files:
-        raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): give a folder of frames")
+        below = [one.name for one in sorted(path.iterdir()) if one.is_dir() and visible_files(one, PICTURES)]
+        remedy = f"give a folder of frames, such as its {below[0]}/" if below else "give a folder of frames"
+        raise UserError(f"{path} holds no pictures ({', '.join(PICTURES)}): {remedy}")
     # A frame's number is its whole name, or else the place in the natural order of names.
     stems = [file.stem for file in files]
     numbered = all(stem.isascii() and stem.isdigit() for stem in stems)

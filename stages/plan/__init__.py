@@ -10,7 +10,13 @@ STAGE = Stage(
     run="stages.plan.run:run",
     needs={
         "ingest": ("keypoints.parquet", "masks/*", "cameras.parquet", "split.json", "footage.json"),
-        "fit": ("identity.safetensors", "poses.parquet", "residuals.parquet", "face.json"),
+        "fit": (
+            "identity.safetensors",
+            "poses.parquet",
+            "fit_quality.parquet",
+            "residuals.parquet",
+            "face.json",
+        ),
     },
     reads_body=True,
 )

@@ -21,6 +21,7 @@ from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import PARTS, pose_body
 from pipeline.clip.boxes import MARGIN
 from pipeline.clip.camera import Camera, project, to_camera
+from pipeline.clip.clock import BREAK, frame_times, usual_step
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.keypoints import FACE, LEFT_HAND, RIGHT_HAND
 from pipeline.clip.plan import AZIMUTH_STEP
@@ -33,7 +34,8 @@ SHOWN = 0.5  # share of a part's points that a frame must show
 LEAST_FRAMES = 0.05  # share of the training frames that must show a part for its size to count
 POINTS = {"face": FACE, "left_hand": LEFT_HAND, "right_hand": RIGHT_HAND}
 LOOKED_AT = 16  # training frames, evenly spaced, in which the pixels between vertices are measured
-LEAST_POINTS, ALIGNMENTS, LAG = 4, 3, 2  # of keypoints that are laid over each other; LAG in frames
+LEAST_POINTS, ALIGNMENTS = 4, 3  # of keypoints that are laid over each other
+LAG = 2.0  # 30ths of a second after which a detector's errors are others
 
 RESIDUALS = pa.schema([("frame", pa.int32()), ("pixels", pa.float32())])
 """The columns of fit's residuals.parquet that are read."""
@@ -189,8 +191,8 @@ def pose_change(clip: FittedClip) -> float:
     Joints that are not seen are fitted to anything, so the fit's own angles say little here; the trusted
     keypoints of each frame are laid over their mean shape instead (moved, turned, scaled), and what is
     left is looked at. A detector's errors do not last, and movements do: so it is not the variance that is
-    taken but the covariance with what is left ``LAG`` frames later (in a clip too short to tell the two
-    apart, the variance). The number is that of the point at the 90th percentile, as a length.
+    taken but the covariance with what is left ``LAG`` later (in a clip too short to tell the two apart, or of
+    single pictures, the variance). The number is that of the point at the 90th percentile, as a length.
     """
     points = clip.keypoints.whole_body[np.isin(clip.keypoints.frames, clip.split.train)]
     trusted = points[..., 2] >= TRUSTED
@@ -200,7 +202,9 @@ def pose_change(clip: FittedClip) -> float:
     usable = trusted.sum(1) >= LEAST_POINTS
     if usable.sum() < 2:
         return 0.0
-    lag = LAG if usable.sum() > 4 * LAG else 0
+    step = usual_step(frame_times(clip.keypoints.frames, clip.footage))
+    lag = 0 if step >= BREAK else max(1, round(LAG / step))
+    lag = lag if usable.sum() > 4 * lag else 0
     laid = places = places[usable]
     for _ in range(ALIGNMENTS):
         mean = np.nanmean(laid, 0)

@@ -42,7 +42,7 @@ class PlanSettings:
     auxiliary_views: Choice = setting("auto", "generated views of the sides that no frame shows")
     pose_refinement: Choice = setting("auto", "the training frames' poses, learnt jointly")
     test_time_refinement: Choice = setting(
-        "auto", "the held-out frames' poses, fitted to their pixels before scoring"
+        "auto", "the held-out frames' poses, fitted to their pixels before scoring, however long it takes"
     )
     seen_torso: Choice = setting("auto", "whether the torso is ever seen")
     seen_head: Choice = setting("auto", "whether the head is ever seen")

@@ -5,12 +5,12 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=6,
+    version=7,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={
         "ingest": ("frames/*", "masks/*", "foreground/*", "cameras.parquet", "split.json", "footage.json"),
-        "fit": ("identity.safetensors", "poses.parquet"),
+        "fit": ("identity.safetensors", "poses.parquet", "fit_quality.parquet"),
         "plan": ("plan.json",),
         "auxiliary": (
             "frames/*",

@@ -1,4 +1,4 @@
-"""Body regions that regularisers weigh apart: hands, face, undersides of arms (Section 3.6, supplement D).
+"""Body regions that regularisers weigh apart: hands, face, scalp, undersides of arms (Section 3.6, D).
 
 What is regularised is what is rendered. ExAvatar also renders and regularises the avatar without its
 pose-dependent part; the paper's Equation 9 does not, and neither does this. The terms on joint offsets
@@ -24,8 +24,8 @@ ARMS = ("left_arm", "right_arm")
 STEEP = 0.5  # cosine of 60 degrees: steeper normals count as above or below an arm
 NEAREST, STRIP = 50, 0.01  # of the upper side's vertices, at most so many within so many metres along X
 
-PartWeights = tuple[float, float, float]
-"""A term's weights on the hands, on the face, and elsewhere."""
+PartWeights = tuple[float, float, float, float]
+"""A term's weights on the hands, on the face, on the rest of the head, and elsewhere."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,11 +82,12 @@ def weighted_by(regions: Regions, factors: Mapping[str, Tensor]) -> Regions:
     return dataclasses.replace(regions, weights={**regions.weights, **changed})
 
 
-def weight_by_part(canonical: Canonical, hands: float, face: float, elsewhere: float) -> Tensor:
-    """A weight for each vertex by its body part, [N, 1]."""
+def weight_by_part(canonical: Canonical, hands: float, face: float, scalp: float, elsewhere: float) -> Tensor:
+    """A weight for each vertex by its body part, [N, 1]; the scalp is the head without the face."""
     values = torch.full((len(canonical), 1), elsewhere, device=canonical.vertices.device)
     values[canonical.is_part(*HANDS)] = hands
     values[canonical.is_part("face")] = face
+    values[canonical.is_part("head")] = scalp
     return values
 
 

@@ -11,6 +11,7 @@ from pipeline.body import BodyModel, Poses
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.views import View, ViewCache
 from stages.train.generated import GeneratedFrames, joined, read_generated
+from stages.train.scene import BackgroundPlate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,7 @@ class TrainingData:
         drawn: the captured frames that are drawn; all of the split's if None.
         texture: [N, 3], the mean colour that the training frames show at each Gaussian; None where
             no term asks for it.
+        scene: what is behind the person in the crops; None where it moves or no term asks for it.
     """
 
     clip: FittedClip
@@ -33,6 +35,7 @@ class TrainingData:
     generated: GeneratedFrames | None = None
     drawn: tuple[int, ...] | None = None
     texture: Tensor | None = None  # [N, 3]
+    scene: BackgroundPlate | None = None
 
     @property
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from pipeline.avatar.storage import save_preview
 from pipeline.run.progress import Progress
 from stages.train.checkpoint import write_checkpoint
 from stages.train.loop import Hook, Trainer
@@ -28,7 +29,7 @@ class NearestSkinning(Hook):
 
 
 class Checkpoints(Hook):
-    """Writes a checkpoint now and then, but for the last iteration."""
+    """Writes a checkpoint now and then, but for the last iteration, and the avatar so far beside it."""
 
     def __init__(self, work: Path, key: str, every: int, timer: TrainingTimer):
         """A hook that has written nothing.
@@ -45,6 +46,7 @@ class Checkpoints(Hook):
         """Writes one where it is time."""
         if trainer.iteration < trainer.settings.iterations and trainer.iteration % self._every == 0:
             write_checkpoint(self._work, trainer.checkpoint(self._key))
+            save_preview(self._work, trainer.avatar)
             self._timer.save(trainer.iteration)
 
 

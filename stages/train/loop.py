@@ -20,8 +20,7 @@ from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
 from stages.train.settings import TrainSettings, learning_rates
 
-BETAS, EPSILON = (0.9, 0.99), 1e-15
-TRANSL_RATE = 0.1  # of the pose's learning rate: a translation moves every pixel at once
+BETA1, EPSILON = 0.9, 1e-15
 
 
 class Hook:
@@ -217,6 +216,7 @@ class Trainer:
         settings = self.settings
         self.avatar.pose_heads_active = schedule.begun(settings, settings.pose_heads_from, self.iteration)
         self.avatar.residuals_active = schedule.begun(settings, settings.residual_from, self.iteration)
+        self.avatar.residual_share = schedule.residual_share(settings, self.iteration)
         factor = schedule.rate_factor(settings, self.iteration)
         for optimizer in (self._avatar_optimizer, self._pose_optimizer):
             for group in optimizer.param_groups:
@@ -226,17 +226,23 @@ class Trainer:
 def _optimizers(
     avatar: Avatar, poses: PoseRefinement, settings: TrainSettings
 ) -> tuple[torch.optim.Adam, torch.optim.Adam]:
-    """One optimiser for the avatar and one for the poses; ``base_rate`` is what the schedule scales."""
+    """One optimiser for the avatar, one for poses and identity; ``base_rate`` is what the schedule scales."""
     groups = avatar.representation.parameter_groups()
-    rate = settings.pose_learning_rate
+    if avatar.opacity_logit is not None:
+        groups["opacity_learning_rate"] = [avatar.opacity_logit]
+    rate, beta2 = settings.pose_learning_rate, settings.adam_beta2
     angles = [*poses.rotation.parameters(), *poses.expression.parameters()]
+    identity = [] if avatar.identity_change is None else list(avatar.identity_change.parameters())
     return (
-        _adam([(parameters, getattr(settings, name)) for name, parameters in groups.items()]),
-        _adam([(angles, rate), (list(poses.transl.parameters()), rate * TRANSL_RATE)]),
+        _adam([(parameters, getattr(settings, name)) for name, parameters in groups.items()], beta2),
+        _adam(
+            [([*angles, *identity], rate), (list(poses.transl.parameters()), rate * settings.transl_rate)],
+            beta2,
+        ),
     )
 
 
-def _adam(groups: list[tuple[list[torch.nn.Parameter], float]]) -> torch.optim.Adam:
+def _adam(groups: list[tuple[list[torch.nn.Parameter], float]], beta2: float) -> torch.optim.Adam:
     described = [{"params": parameters, "lr": rate, "base_rate": rate} for parameters, rate in groups]
     # The fused kernel is ten times faster on a CPU than the loop over tensors; CUDA has one, too.
-    return torch.optim.Adam(described, betas=BETAS, eps=EPSILON, fused=True)
+    return torch.optim.Adam(described, betas=(BETA1, beta2), eps=EPSILON, fused=True)

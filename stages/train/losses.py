@@ -49,6 +49,13 @@ def lpips(
     return network(image, target)[0]
 
 
+def size(
+    values: Tensor,  # [N, C]
+) -> Tensor:
+    """The sizes of values, [N, C]."""
+    return values.abs()
+
+
 def l2(
     values: Tensor,  # [N, C]
 ) -> Tensor:

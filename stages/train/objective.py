@@ -48,12 +48,16 @@ class Term(Generic[Source]):
         loss: what is computed; its values are unreduced.
         of: its arguments; the term is left out where one of them is None.
         weight: the setting that weighs it.
-        hands, face: the settings that weigh it on these parts instead, a vertex at a time.
+        hands, face, scalp: the settings that weigh it on these parts instead, a vertex at a time.
         smooths: it counts more, a vertex at a time, where evidence of what it smooths is weak: "color" or
             "shape"; not at all differently if empty.
         generated: the setting that weighs it on generated frames instead.
         captured_only: it is not taken of generated frames.
         since: the setting with the fraction of the run from which it takes part; from the start if empty.
+        needs: the setting without which it is not taken.
+        share: which part of the weight it has in a frame; all of it if None.
+        times: the setting with how many renderings of a frame it stands for; of generated frames always the
+            pictures'.
         every: the setting with the draws for one that it is taken of, with as many times the weight, so
             that its mean over the run is that of a term of every draw.
         mask: weights of single values.
@@ -66,39 +70,49 @@ class Term(Generic[Source]):
     weight: str
     hands: str = ""
     face: str = ""
+    scalp: str = ""
     smooths: str = ""
     generated: str = ""
     captured_only: bool = False
     since: str = ""
+    times: str = ""
     every: str = ""
     mask: Callable[[Source], Tensor | None] | None = None
     count: Callable[[Source], int] | None = None
+    needs: str = ""
+    share: Callable[[Source], float] | None = None
 
     @property
     def by_part(self) -> bool:
         """True where each vertex has the weight of its body part."""
-        return bool(self.hands or self.face)
+        return bool(self.hands or self.face or self.scalp)
 
     @property
     def weights(self) -> tuple[str, ...]:
         """The settings that weigh it on captured frames."""
-        return tuple(name for name in (self.weight, self.hands, self.face) if name)
+        return tuple(name for name in (self.weight, self.hands, self.face, self.scalp) if name)
 
     def part_weights(self, settings: TrainSettings) -> PartWeights:
-        """The weights on hands, face and elsewhere."""
-        hands, face = (getattr(settings, name or self.weight) for name in (self.hands, self.face))
-        return hands, face, getattr(settings, self.weight)
+        """The weights on hands, face, scalp and elsewhere."""
+        names = (self.hands, self.face, self.scalp, self.weight)
+        hands, face, scalp, elsewhere = (getattr(settings, name or self.weight) for name in names)
+        return hands, face, scalp, elsewhere
 
     def scalar_weight(self, settings: TrainSettings, generated: bool) -> float:
         """The factor of its weighted mean; 1 where vertices have weights of their own."""
         if self.by_part:
             return 1.0
-        weight: float = getattr(settings, self.generated if generated and self.generated else self.weight)
+        made = bool(generated and self.generated and not settings.generated_as_captured)
+        weight: float = getattr(settings, self.generated if made else self.weight)
+        if self.times:
+            weight *= settings.renderings if made else getattr(settings, self.times)
         return weight * getattr(settings, self.every) if self.every else weight
 
     def first_iteration(self, settings: TrainSettings) -> int | None:
         """The first iteration that it takes part in; None where it has no weight or never begins."""
         if not any(getattr(settings, name) for name in self.weights):
+            return None
+        if self.needs and not getattr(settings, self.needs):
             return None
         return schedule.first_iteration(settings, getattr(settings, self.since)) if self.since else 0
 
@@ -120,19 +134,25 @@ class Term(Generic[Source]):
 # fmt: off
 FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
     # Pictures over the drawn background: L_1, L_ssim and L_lpips
-    Term("l1", losses.l1, lambda f: (f.image, f.target), "l1", generated="generated"),
-    Term("ssim", ssim_loss, lambda f: (f.image, f.target), "ssim", generated="generated"),
+    Term("l1", losses.l1, lambda f: (f.image, f.target), "l1", generated="generated",
+         times="l1_renderings", share=lambda f: f.color_share),
+    Term("l1_scene", losses.l1, lambda f: f.over_scene or (None,), "l1", times="l1_renderings",
+         captured_only=True, needs="scene_share", share=lambda f: f.scene_share),
+    Term("ssim", ssim_loss, lambda f: f.pictures, "ssim", generated="generated",
+         times="renderings"),
     Term("lpips", losses.lpips, lambda f: (f.network, *f.crops), "lpips", generated="generated",
-         since="lpips_from", every="lpips_every"),
+         since="lpips_from", times="renderings", every="lpips_every"),
     # L_reg of what is rendered, by body part (Section 3.6; ExAvatar)
-    Term("laplacian_scale", losses.laplacian, lambda f: (f.posed.log_scale, f.neighbours),
+    Term("laplacian_scale", losses.laplacian, lambda f: (f.compared_scale, f.neighbours),
          "laplacian_scale", face="laplacian_scale_face", smooths="shape", mask=lambda f: f.unmixed),
     Term("laplacian_color", losses.laplacian, lambda f: (f.colors, f.neighbours),
          "laplacian_color", hands="laplacian_color_hands", smooths="color", mask=lambda f: f.unmixed),
     Term("scale_size", losses.l2, lambda f: (f.posed.gaussians.scales,),
-         "scale_size", hands="scale_size_hands"),
+         "scale_size", hands="scale_size_hands", face="scale_size_face"),
     Term("scale_shrink", losses.scale_shrink, lambda f: (f.posed.log_scale,), "scale_shrink"),
     Term("scale_growth", losses.scale_growth, lambda f: (f.posed.log_scale,), "scale_growth"),
+    Term("pose_scale", losses.l2, lambda f: (f.scale_change,),
+         "pose_scale", hands="pose_scale_hands", face="pose_scale_face", since="pose_heads_from"),
     Term("hand_color", losses.color_variance, lambda f: (f.regions.on_hands(f.colors),), "hand_color"),
     Term("arm_color", losses.l2, lambda f: (f.underside_contrast,), "arm_color"),
     Term("laplacian_pose_offset", losses.laplacian, lambda f: (f.offset, f.neighbours),
@@ -143,7 +163,7 @@ FRAME_TERMS: tuple[Term[RenderedFrame], ...] = (
          since="residual_from"),
     # L_face: the face in its mean texture, where it covers the person; a mean over the whole crop
     Term("face", losses.l1, lambda f: (f.face.color, f.face.pixels_of(f.view.color)), "face",
-         captured_only=True, mask=lambda f: f.face.pixels_of(f.view.alpha)[:, None],
+         times="renderings", captured_only=True, mask=lambda f: f.face.pixels_of(f.view.alpha)[:, None],
          count=lambda f: f.view.color.numel()),
     Term("pose_change", losses.l2, lambda f: (f.pose_change,), "pose_change", captured_only=True,
          since="refine_from"),
@@ -152,7 +172,9 @@ STATIC_TERMS: tuple[Term[StaticAvatar], ...] = (
     Term("laplacian_offset", losses.laplacian, lambda s: (s.decoded.offset, s.neighbours),
          "laplacian_offset", face="laplacian_offset_face", smooths="shape"),
     Term("offset", losses.l2, lambda s: (s.decoded.offset,), "offset", hands="offset_hands",
-         face="offset_face"),
+         face="offset_face", scalp="offset_scalp"),
+    Term("joint_change", losses.l2, lambda s: (s.joint_change,), "joint_change"),
+    Term("joint_symmetry", losses.size, lambda s: (s.joint_asymmetry,), "joint_symmetry"),
     Term("hand_normal", losses.outward_offset,
          lambda s: (s.regions.on_hands(s.decoded.offset), s.regions.on_hands(s.normals)), "hand_normal"),
 )
@@ -179,6 +201,7 @@ class TrainingObjective:
         data: what it is compared with.
         settings: the weights.
         texture: [N, 3], the data's, where the avatar is; None where no term asks for it.
+        scene: behind the person, the data's, where the avatar is; None where it is not compared.
         network: LPIPS; None where it has no weight.
         on_frame: called with each rendered frame's pose and view.
         visibility_cache: which Gaussians each frame showed when it was last drawn.
@@ -212,6 +235,7 @@ class TrainingObjective:
             raise ValueError("the face term needs a texture")
         self.avatar, self.poses, self.data, self.settings = avatar, poses, data, settings
         self.texture = moved(data.texture, avatar.device)
+        self.scene = None if data.scene is None else data.scene.to(avatar.device)
         self.network = None if network is None else network.to(avatar.device)
         self.on_frame = on_frame
         count = len(avatar.surfaces[-1].canonical)
@@ -233,7 +257,8 @@ class TrainingObjective:
             terms = self._evaluate(FRAME_TERMS, frame, iteration, position, frame.view.generated)
             for name, value in terms.items():
                 total[name] = total.get(name, torch.zeros_like(value)) + value / batch
-        static = StaticAvatar(decoded=decoded, regions=self._regions(decoded.surface))
+        identity = self.avatar.identity_change
+        static = StaticAvatar(decoded=decoded, regions=self._regions(decoded.surface), identity=identity)
         return {**total, **self._evaluate(STATIC_TERMS, static, iteration)}
 
     def draw(self, position: int) -> Draw:
@@ -267,6 +292,9 @@ class TrainingObjective:
             texture=self.texture,
             network=self.network,
             crop_side=self.settings.lpips_crop,
+            metres=self.settings.scale_smoothness == "metres",
+            scene=self.scene,
+            scene_share=self.settings.scene_share,
         )
 
     def _evaluate(
@@ -284,7 +312,8 @@ class TrainingObjective:
                 continue
             mean = _reduced(term, source)
             if mean is not None:
-                found[term.name] = term.scalar_weight(self.settings, generated) * mean
+                weight = term.scalar_weight(self.settings, generated)
+                found[term.name] = (weight if term.share is None else weight * term.share(source)) * mean
         return found
 
     def _regions(self, surface: Surface) -> Regions:

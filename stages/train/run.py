@@ -25,6 +25,7 @@ from stages.train.loop import Hook, Trainer
 from stages.train.objective import describe_objective
 from stages.train.poses import PoseRefinement
 from stages.train.publish import publish
+from stages.train.scene import read_scene
 from stages.train.schedule import step_costs
 from stages.train.settings import (
     TrainSettings,
@@ -60,6 +61,8 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     data = read_training_data(inputs["ingest"], inputs["fit"], auxiliary, context.body_file, margin)
     plan = read_plan(inputs["plan"] / "plan.json")
     settings = apply_plan(context.settings, plan)
+    if context.settings.face and not settings.face:
+        log(f"no face loss, though train.face is {context.settings.face:g}: {plan['face_loss'].why}")
     device = resolve(settings.device)
     log_computing(context, device)
     started = time.monotonic()
@@ -117,7 +120,10 @@ def build_trainer(
     drawn = frames_to_draw(data, settings.iterations * settings.batch, settings.visits)
     if len(drawn) < len(data.clip.split.train):
         log(f"draws the {len(drawn)} most different of {len(data.clip.split.train)} training frames")
-    data = dataclasses.replace(data, drawn=drawn)
+    scene = read_scene(data.clip, data.crops.box) if settings.scene_share else None
+    if settings.scene_share and scene is None:
+        log("the camera moves: frames are compared over drawn colours alone")
+    data = dataclasses.replace(data, drawn=drawn, scene=scene)
     refinement = PoseRefinement(moved(data.poses, device), data.clip.split.train)
     avatar, data = initial_avatar(data, refinement, settings, log)
     hooks: dict[str, Hook] = {}

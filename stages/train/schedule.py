@@ -17,6 +17,7 @@ from torch import Tensor
 
 from stages.train.settings import TrainSettings
 
+STEPS = ((0.95, 0.01), (0.75, 0.1), (0.0, 1.0))  # from this share of the run on, this factor
 FRAMES, BACKGROUND, POSE_NOISE, TIME, CROP, SOURCE = 1, 2, 3, 4, 5, 6  # purposes
 
 # Costs in Gaussians' static heads, read off runs of `smile`: of a triplane, subdivided and with all heads, a
@@ -49,8 +50,11 @@ class Draw:
 
 
 def rate_factor(settings: TrainSettings, iteration: int) -> float:
-    """The factor of the learning rates: a short linear rise, then a cosine."""
+    """The factor of the learning rates: a short linear rise, then a cosine, or steps (ExAvatar's)."""
     done = iteration / settings.iterations
+    if settings.schedule == "steps":
+        warm = min(1.0, (iteration + 1) / max(1, settings.warm_up))
+        return warm * next(factor for share, factor in STEPS if done >= share)
     cosine = 0.5 * (1 + math.cos(math.pi * done))
     warm = min(1.0, (iteration + 1) / max(1, settings.warm_up))
     return warm * (settings.final_rate + (1 - settings.final_rate) * cosine)
@@ -64,6 +68,14 @@ def reached(settings: TrainSettings, fraction: float, iteration: int) -> bool:
 def begun(settings: TrainSettings, fraction: float, iteration: int) -> bool:
     """True where something that starts at ``fraction`` of the run takes part; 1 stands for never."""
     return fraction < 1 and reached(settings, fraction, iteration)
+
+
+def residual_share(settings: TrainSettings, iteration: int) -> float:
+    """The share of the residual colours that is added: from 0 to 1 over ``residual_ramp``."""
+    if not settings.residual_ramp:
+        return 1.0
+    done = iteration / settings.iterations - settings.residual_from
+    return min(1.0, max(0.0, done / settings.residual_ramp))
 
 
 def first_iteration(settings: TrainSettings, fraction: float) -> int | None:

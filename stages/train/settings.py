@@ -52,7 +52,8 @@ IGNORED = {
         "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
         "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
         "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
-        "time_frequencies", "time_dropout", "learning_rate", "plane_learning_rate",
+        "time_frequencies", "time_dropout", "residual_ramp", "plane_deviation", "plane_pose", "learning_rate",
+        "plane_learning_rate",
     ),
 }  # fmt: skip
 """The settings that a representation does not read."""
@@ -107,13 +108,22 @@ class TrainSettings:
     subdivide_from: Fraction = setting(0.5, "fraction of the run before which the mesh stays unsubdivided")
     plane_resolution: Texels = setting(128, "texels along a side of each plane")
     plane_channels: Channels = setting(32, "features a texel")
+    plane_deviation: Deviation = setting(0.01, "standard deviation of the planes' first features")
     width: Channels = setting(128, "hidden channels of the heads")
     groups: Channels = setting(8, "of the heads' GroupNorm; must divide width")
     offset_unit: Metres = setting(0.04, "metres that a static offset of 1 stands for")
     pose_offset_unit: Metres = setting(0.01, "metres that a pose-dependent offset of 1 stands for")
     scale: Size = setting(0.55, "initial standard deviation of a Gaussian, in mean edge lengths")
     thickness: Size = setting(0.5, "initial standard deviation along the normal, in those along the surface")
-    opacity: Opacity = setting(0.999, "of every Gaussian")
+    opacity: Opacity = setting(0.999, "of every Gaussian, or to begin with")
+    learn_opacity: bool = setting(False, "each Gaussian has an opacity of its own")
+    learn_identity: bool = setting(False, "betas and joint offsets move with the poses")
+    correctives: Literal["all", "face_and_hands"] = setting(
+        "all", "where the body model's pose correctives act; pose heads do not move head and hands"
+    )
+    plane_pose: Literal["own", "open"] = setting(
+        "own", "rest mesh that the planes are laid over: the person's, or the mean's, legs and mouth open"
+    )
     skinning: Literal["own", "nearest"] = setting(
         "own", "weights of the Gaussian's own vertex, or of the nearest: the one that it has come to lie at"
     )
@@ -134,12 +144,13 @@ class TrainSettings:
 
     # Residual colours (Section 3.5). A part that the plan does not name gets no head.
     residual_parts: tuple[ResidualPart, ...] = setting(
-        ("face", "left_hand", "right_hand"), "parts with a residual head; rest: the authors' fourth net"
+        ("face", "left_hand", "right_hand"), "parts with a residual head; rest: the whole body, an ablation"
     )
     residual_moves: bool = setting(False, "move Gaussians, too: the ablation of the paper's supplement E.3")
     residual_from: Fraction = setting(
         0.5, "fraction of the run from which the residual heads take part; 1: never"
     )
+    residual_ramp: Fraction = setting(0.0, "fraction of the run over which their colours come in evenly")
     residual_width: Channels = setting(64, "hidden channels; the authors' release has 256")
     residual_place: ResidualPlace = setting(
         "canonical", "what they are told of a Gaussian's place; posed: in the world"
@@ -158,6 +169,9 @@ class TrainSettings:
     gate_threshold: Threshold | None = setting(
         None, "scores below are gated; none: found in the scores (Otsu)"
     )
+    gate_rule: Literal["evidence", "otsu"] = setting(
+        "evidence", "Otsu's threshold only where little of what is seen goes with it, or as it is"
+    )
     gate_rings: Rings = setting(2, "rings of neighbours added to what is left")
     unseen: Literal["completed", "generated", "base", "nothing"] = setting(
         "completed",
@@ -171,12 +185,18 @@ class TrainSettings:
     color_learning_rate: LearningRate = setting(0.02, "of the bases' representation: static colours, logits")
     scale_learning_rate: LearningRate = setting(0.01, "likewise: log scales")
     offset_learning_rate: LearningRate = setting(0.01, "likewise: static offsets, in offset_unit")
+    opacity_learning_rate: LearningRate = setting(0.01, "of opacities, logits, where they are learnt")
     bases_learning_rate: LearningRate = setting(0.002, "likewise: the linear bases")
+    schedule: Literal["cosine", "steps"] = setting(
+        "cosine", "of the rates; steps: a tenth after 75% of the run and a hundredth after 95%"
+    )
     final_rate: Fraction = setting(0.05, "the cosine schedule's last factor")
+    adam_beta2: Fraction = setting(0.99, "Adam's second beta; the first is 0.9")
     warm_up: CountOrNone = setting(20, "iterations")
     refine_poses: bool = setting(True, "optimise the training frames' poses too")
     refine_from: Fraction = setting(0.15, "fraction of the run from which they move")
-    pose_learning_rate: LearningRate = setting(1e-4, "of rotations and expressions; a tenth of it for transl")
+    pose_learning_rate: LearningRate = setting(1e-4, "of rotations and expressions")
+    transl_rate: Factor = setting(0.1, "times that, for transl: a translation moves every pixel at once")
 
     # Objective
     l1: Weight = setting(0.8, "lambda_L1")
@@ -192,27 +212,46 @@ class TrainSettings:
     lpips_from: Fraction = setting(0.5, "fraction of the run from which it takes part")
     face: Weight = setting(0.0, "lambda_face; the paper's is 0.8")
     generated_every: Count = setting(5, "draws for one of a generated frame; the paper's is 2, equally often")
+    generated_as_captured: bool = setting(False, "generated frames weigh as much as captured ones instead")
     generated: Weight = setting(0.1, "lambda_L1, lambda_ssim and lambda_lpips on generated frames")
+
+    # ExAvatar renders a frame several times and compares each rendering: docs/paper.md counts.
+    l1_renderings: Factor = setting(1.0, "renderings of a captured frame that lambda_L1 stands for")
+    renderings: Factor = setting(1.0, "the same of SSIM, LPIPS, face, and all of generated frames")
+
+    scene_share: Fraction = setting(
+        0.0, "share of L1, and all of SSIM and LPIPS, over the clip's own background where the camera stands"
+    )
 
     # Regularisers, each weighted with its value; the paper's values are in data/presets/paper.toml
     laplacian_offset: Weight = setting(1e3, "smoothness of static and of all offsets together")
     laplacian_offset_face: Weight = setting(1e3, "the same on the face")
-    laplacian_scale: Weight = setting(0.02, "smoothness of log scales")
+    laplacian_scale: Weight = setting(0.02, "smoothness of scales")
     laplacian_scale_face: Weight = setting(0.02, "the same on the face")
+    scale_smoothness: Literal["relative", "metres"] = setting(
+        "relative", "scales whose smoothness that is: logarithms of multiples of the first ones, or metres"
+    )
     laplacian_color: Weight = setting(0.002, "smoothness of colours")
     laplacian_color_hands: Weight = setting(0.002, "the same on the hands")
     offset: Weight = setting(10.0, "size of static offsets, metres squared")
     offset_hands: Weight = setting(1000.0, "the same on the hands")
     offset_face: Weight = setting(10.0, "the same on the face")
+    offset_scalp: Weight = setting(10.0, "the same on the head without the face")
     pose_offset: Weight = setting(50.0, "size of pose-dependent offsets, metres squared")
     hand_normal: Weight = setting(0.0, "static offsets of the hands that point outwards")
     scale_size: Weight = setting(0.0, "size of scales, metres squared")
     scale_size_hands: Weight = setting(0.0, "the same on the hands")
+    scale_size_face: Weight = setting(0.0, "the same on the face")
+    pose_scale: Weight = setting(0.0, "size of pose-dependent changes of log scales")
+    pose_scale_hands: Weight = setting(0.0, "the same on the hands")
+    pose_scale_face: Weight = setting(0.0, "the same on the face")
     scale_growth: Weight = setting(0.002, "log scales above the initial ones")
     scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
     weak_smoothness: Factor = setting(
         10.0, "times more that smoothness counts where no frame showed enough, continuously"
     )
+    joint_change: Weight = setting(0.0, "size of learnt joint offsets, metres squared; tenfold on the hands")
+    joint_symmetry: Weight = setting(0.0, "differences of left and right joint offsets, metres")
     hand_color: Weight = setting(0.0, "differences of the hands' colours from their mean")
     arm_color: Weight = setting(0.0, "differences of the arms' lower sides from their upper sides")
     residual_size: Weight = setting(1e-3, "size of residual colours, in logits")
@@ -224,6 +263,10 @@ class TrainSettings:
     def _fit_together(self) -> TrainSettings:
         if self.subdivisions and self.subdivide_from == 1:
             raise ValueError("train.subdivide_from must be less than 1, or train.subdivisions 0")
+        if self.residual_from < 1 and self.residual_from + self.residual_ramp > 1:
+            raise ValueError("train.residual_from and train.residual_ramp must add up to at most 1")
+        if self.adam_beta2 == 1:
+            raise ValueError("train.adam_beta2 must be less than 1")
         if self.width % self.groups:
             raise ValueError(f"train.groups must divide train.width, {self.width}, not be {self.groups}")
         if self.residual_width % self.groups:
@@ -296,10 +339,11 @@ def settings_without_effect(settings: TrainSettings) -> tuple[str, ...]:
 
 def learning_rates(settings: TrainSettings) -> tuple[str, ...]:
     """The names of the learning rates that are in use, the pictures' first."""
+    opacity = ("opacity_learning_rate",) if settings.learn_opacity else ()
     if settings.representation == "triplane":
-        return ("learning_rate", "plane_learning_rate", "pose_learning_rate")
+        return ("learning_rate", "plane_learning_rate", *opacity, "pose_learning_rate")
     own = ("color_learning_rate", "scale_learning_rate", "offset_learning_rate", "bases_learning_rate")
-    return (*own, "pose_learning_rate")
+    return (*own, *opacity, "pose_learning_rate")
 
 
 def subdivision_levels(plan: Plan) -> int:

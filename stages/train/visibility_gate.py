@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
-from pipeline.avatar.otsu_threshold import Threshold, evidence_threshold, fixed_threshold
+from pipeline.avatar.otsu_threshold import Threshold, evidence_threshold, fixed_threshold, plain_threshold
 from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import Pose
 from pipeline.clip.views import View, ViewCache
@@ -151,7 +151,9 @@ class VisibilityGate(nn.Module, Hook):
 
     def _find_threshold(self, scores: np.ndarray) -> Threshold:
         fixed = self._settings.gate_threshold
-        return evidence_threshold(scores) if fixed is None else fixed_threshold(scores, fixed)
+        if fixed is not None:
+            return fixed_threshold(scores, fixed)
+        return plain_threshold(scores) if self._settings.gate_rule == "otsu" else evidence_threshold(scores)
 
     def write(self, folder: Path) -> tuple[np.ndarray, np.ndarray]:
         """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the threshold.

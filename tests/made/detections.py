@@ -64,8 +64,15 @@ def true_poses(frames: tuple[int, ...], distance: float = 3.0) -> Poses:
 def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bool = False) -> DetectedClip:
     """The clip; the hands are never detected, the face only if asked for."""
     frames = tuple(range(3, 3 + gap * count, gap))
-    poses = true_poses(frames)
     camera = facing_camera(SIZE, SIZE, 1.2 * SIZE)
+    return detected_poses(body, landmarks, true_poses(frames), dict.fromkeys(frames, camera), face)
+
+
+def detected_poses(
+    body, landmarks: Landmarks, poses: Poses, cameras: dict[int, Camera], face: bool = False
+) -> DetectedClip:
+    """The clip of some poses before one camera; what is detected is as in ``make_clip``."""
+    frames, count, camera = poses.frames, len(poses), next(iter(cameras.values()))
     vertices, joints = pose_body(body, mean_identity(body), poses.rotation, poses.expression, poses.transl)
 
     def seen(points):  # -> [T, K, 4], pixels and score
@@ -83,7 +90,7 @@ def make_clip(body, landmarks: Landmarks, count: int = 6, gap: int = 1, face: bo
         pose_world=np.concatenate([world.numpy(), np.ones((count, 33, 1), np.float32)], -1),
         face_mesh=seen(landmarks.face_mesh) if face else blank.face_mesh,
     )
-    return DetectedClip(keypoints, dict.fromkeys(frames, camera), poses, joints)
+    return DetectedClip(keypoints, cameras, poses, joints)
 
 
 def whole_body(clip: DetectedClip, body, landmarks: Landmarks) -> DetectedClip:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import roma
@@ -92,3 +95,15 @@ def flame_arrays(body, expressions: int = 100, seed: int = 0) -> dict[str, np.nd
         "shapedirs": directions,
         "J_regressor": regressor,
     }
+
+
+def write_deca(folder: Path, frames: Mapping[int, bool], shape: int = 10) -> Path:
+    """DECA's files of frames, number -> whether a face was found; the expression grows with the number."""
+    (folder / "flame_params").mkdir(parents=True)
+    (folder / "shape_param.json").write_text(json.dumps([0.5] * shape))
+    for frame, valid in frames.items():
+        values = {"expr": [0.1 * frame] * 50, "jaw_pose": [0.2, 0.0, 0.0]} if valid else {}
+        blank = dict.fromkeys(("root_pose", "neck_pose", "jaw_pose", "leye_pose", "reye_pose", "expr"))
+        content = {**blank, **values, "is_valid": valid}
+        (folder / "flame_params" / f"{frame}.json").write_text(json.dumps(content))
+    return folder

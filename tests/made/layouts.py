@@ -150,10 +150,15 @@ def distorted(image: np.ndarray, matrix: np.ndarray, bend: np.ndarray, how: int)
     return cv2.remap(image, where[..., 0], where[..., 1], how, borderMode=cv2.BORDER_REPLICATE)
 
 
-def zju(folder: Path, shown: Footage, bend: np.ndarray) -> Path:
-    """annots.npy with K, D, R, T in mm, a world whose Z is up, SMPL about the origin; every fifth frame."""
+def zju(folder: Path, shown: Footage, bend: np.ndarray, refined: bool = True) -> Path:
+    """annots.npy with K, D, R, T in mm, a world whose Z is up, SMPL about the origin; every fifth frame.
+
+    ``refined``: as GauHuman reads it, images/00 with mask/00 and smpl_params; otherwise neuralbody's original
+    release, Camera_B1 with mask_cihp/Camera_B1 (labels of body parts) and new_params.
+    """
     cams: dict[str, list] = {"K": [], "D": [], "R": [], "T": []}
-    names = ["Camera_B1", "Camera_B2", "Camera_B3"]
+    names = ["images/00", "images/01", "images/02"] if refined else ["Camera_B1", "Camera_B2", "Camera_B3"]
+    masks_of, poses_of = ("mask", "smpl_params") if refined else ("mask_cihp", "new_params")
     for take, name in zip(shown.rig, names, strict=True):
         matrix = take.matrix.copy()
         matrix[:2, 2] -= 0.5  # OpenCV counts from the first pixel's centre
@@ -164,14 +169,13 @@ def zju(folder: Path, shown: Footage, bend: np.ndarray) -> Path:
         files = [f"{5 * row:06d}" for row in range(len(take.images))]
         images = [distorted(one, matrix, bend, cv2.INTER_LINEAR) for one in take.images]
         masks = [distorted(one, matrix, bend, cv2.INTER_LINEAR) for one in take.masks]
+        labels = [(m > 127).astype(np.uint8) * (1 if refined else 5) for m in masks]
         pictures(folder / name, images, [f"{file}.jpg" for file in files])
-        pictures(
-            folder / "mask" / name, [(m > 127).astype(np.uint8) for m in masks], [f"{f}.png" for f in files]
-        )
+        pictures(folder / masks_of / name.removeprefix("images/"), labels, [f"{f}.png" for f in files])
     count = 5 * (len(shown.still.images) - 1) + 1
     ims = [{"ims": [f"{name}/{frame:06d}.jpg" for name in names]} for frame in range(count)]
     np.save(folder / "annots.npy", {"cams": cams, "ims": ims}, allow_pickle=True)
-    (folder / "smpl_params").mkdir()
+    (folder / poses_of).mkdir()
     for row in range(len(shown.still.images)):
         turn = Z_UP @ shown.orient[row]
         place = Z_UP @ shown.pelvis[row] - turn @ SMPL_ROOT
@@ -179,7 +183,7 @@ def zju(folder: Path, shown: Footage, bend: np.ndarray) -> Path:
             "Rh": rotvec(turn).reshape(1, 3), "Th": place.reshape(1, 3), "shapes": np.zeros((1, 10)),
             "poses": smpl72(shown, row, np.zeros(3)).reshape(1, 72),
         }  # fmt: skip
-        np.save(folder / "smpl_params" / f"{5 * row}.npy", value, allow_pickle=True)
+        np.save(folder / poses_of / f"{5 * row}.npy", value, allow_pickle=True)
     return folder
 
 
@@ -207,8 +211,11 @@ def wildavatar(folder: Path, shown: Footage) -> Path:
     return folder
 
 
-def talkshow(folder: Path, shown: Footage, pickled: bool = True) -> Path:
-    """<seq>.mp4 and SHOW's <seq>.pkl with torch tensors; hands are 12 PCA numbers."""
+def talkshow(folder: Path, shown: Footage, pickled: bool = True, listed: bool = False) -> Path:
+    """<seq>.mp4 and SHOW's <seq>.pkl with torch tensors, in a list if ``listed``; hands are 12 PCA numbers.
+
+    PyTorch3D's x and y point the other way: x and y of camera_transl are the negative of OpenCV's.
+    """
     take, count = shown.still, len(shown.still.images)
     folder.mkdir(parents=True, exist_ok=True)
     write_clip(folder / "212-00_00_00.mp4", take.images)
@@ -216,6 +223,7 @@ def talkshow(folder: Path, shown: Footage, pickled: bool = True) -> Path:
         return folder
     angles = np.stack([local(shown, row) for row in range(count)])
     camera_transl = np.array([0.3, -0.2, 4.0])
+    in_opencv = np.array([-0.3, 0.2, 4.0])
     places = np.stack([in_camera(shown, take, row)[1] for row in range(count)])
     table = {
         "width": SIZE, "height": SIZE, "center": torch.tensor(take.matrix[:2, 2]), "batch_size": count,
@@ -225,11 +233,11 @@ def talkshow(folder: Path, shown: Footage, pickled: bool = True) -> Path:
         "body_pose_axis": torch.tensor(angles[:, 1:22].reshape(count, 63)),
         "jaw_pose": torch.tensor(angles[:, 22]), "leye_pose": torch.tensor(angles[:, 23]),
         "reye_pose": torch.tensor(angles[:, 24]), "expression": torch.zeros(count, 100),
-        "betas": torch.zeros(1, 300), "transl": torch.tensor(places - shown.root - camera_transl),
+        "betas": torch.zeros(1, 300), "transl": torch.tensor(places - shown.root - in_opencv),
         "left_hand_pose": torch.zeros(count, 12), "right_hand_pose": torch.zeros(count, 12),
         "pose_embedding": torch.zeros(count, 32),
     }  # fmt: skip
-    (folder / "212-00_00_00.pkl").write_bytes(pickle.dumps(table))
+    (folder / "212-00_00_00.pkl").write_bytes(pickle.dumps([table] if listed else table))
     return folder
 
 
@@ -238,19 +246,24 @@ def head_camera(shown: Footage, row: int) -> tuple[np.ndarray, np.ndarray]:
     return in_camera(shown, shown.still, row)
 
 
-def insta(folder: Path, shown: Footage) -> Path:
-    """RGBA images, transforms*.json (camera-to-world, OpenGL axes), checkpoint/*.frame torch files."""
+def insta(folder: Path, shown: Footage, axes: str = "opencv", texts: bool = False) -> Path:
+    """RGBA images, transforms*.json (camera-to-world), and the tracker's checkpoint/*.frame torch files.
+
+    scripts/transforms.py inverts the tracker's opencv R, t and leaves its axes; frames stand in the order in
+    which its processes finished. ``texts``: flame/{exp,jaw,eyes}/*.txt in the place of checkpoint/.
+    """
     take, count = shown.still, len(shown.still.images)
     numbers = list(range(1, count + 1))
     rgba = [np.dstack([take.images[row], take.masks[row]]) for row in range(count)]
     pictures(folder / "images", rgba, [f"{n:05d}.png" for n in numbers])
     (folder / "checkpoint").mkdir()
+    flip = np.diag([1.0, 1.0, 1.0, 1.0] if axes == "opencv" else [1.0, -1.0, -1.0, 1.0])
     frames = []
     for row, n in enumerate(numbers):
         turn, shift = head_camera(shown, row)
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = turn, shift
-        c2w = np.linalg.inv(view) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        c2w = np.linalg.inv(view) @ flip
         frames.append({"file_path": f"images/{n:05d}.png", "transform_matrix": c2w.tolist(),
                        "exp_path": f"flame/exp/{n:05d}.txt", "mesh_path": f"meshes/{n:05d}.obj"})  # fmt: skip
         angles = local(shown, row)
@@ -264,23 +277,36 @@ def insta(folder: Path, shown: Footage) -> Path:
             "camera": {"R": torch.eye(3)[None], "t": torch.zeros(1, 3)},
             "img_size": np.array([SIZE, SIZE]), "frame_id": f"{n:05d}",
         }  # fmt: skip
-        torch.save(value, folder / "checkpoint" / f"{n:05d}.frame")
+        if not texts:
+            torch.save(value, folder / "checkpoint" / f"{n:05d}.frame")
+            continue
+        for key in ("exp", "jaw", "eyes"):
+            (folder / "flame" / key).mkdir(parents=True, exist_ok=True)
+            np.savetxt(folder / "flame" / key / f"{n:05d}.txt", value["flame"][key][0], fmt="%.8f")
+    if texts:
+        (folder / "checkpoint").rmdir()
     k = take.matrix
     common = {"cx": k[0, 2], "cy": k[1, 2], "fl_x": k[0, 0], "fl_y": k[1, 1], "w": SIZE, "h": SIZE,
               "camera_angle_x": 2 * float(np.arctan(SIZE / 2 / k[0, 0]))}  # fmt: skip
     for part, chosen in (("", frames), ("_train", frames[:4]), ("_test", frames[4:])):
-        put(folder / f"transforms{part}.json", {**common, "frames": chosen})
+        put(folder / f"transforms{part}.json", {**common, "frames": chosen[::-1]})
     return folder
 
 
-def xhumans(folder: Path, shown: Footage) -> Path:
-    """render/image, render/cameras.npz, SMPLX pickles in the world, whose Z is up here."""
+def xhumans(folder: Path, shown: Footage, first: int = 1) -> Path:
+    """render/image, render/cameras.npz, SMPLX pickles in the world, whose Z is up here.
+
+    Pictures are counted from 1, the meshes from ``first``; the pickles' betas are not to be used.
+    """
     take, count = shown.moving, len(shown.moving.images)
     numbers = list(range(1, count + 1))
     pictures(folder / "render" / "image", take.images, [f"color_{n:06d}.png" for n in numbers])
     keypoint_files(folder / "render" / "keypoints_whole_body", take.keypoints, numbers)
     extrinsic = np.stack(
-        [np.column_stack([take.rotation[r] @ Z_UP.T, take.translation[r]]) for r in range(count)]
+        [
+            np.vstack([np.column_stack([take.rotation[r] @ Z_UP.T, take.translation[r]]), [0, 0, 0, 1.0]])
+            for r in range(count)
+        ]
     )
     np.savez(folder / "render" / "cameras.npz", intrinsic=take.matrix, extrinsic=extrinsic)
     (folder / "SMPLX").mkdir()
@@ -291,9 +317,9 @@ def xhumans(folder: Path, shown: Footage) -> Path:
             "global_orient": rotvec(Z_UP @ shown.orient[row]), "body_pose": angles[1:22].ravel(),
             "jaw_pose": angles[22], "leye_pose": angles[23], "reye_pose": angles[24],
             "left_hand_pose": hands[0], "right_hand_pose": hands[1], "expression": np.zeros(10),
-            "betas": np.zeros(10), "transl": Z_UP @ shown.pelvis[row] - SMPLX_ROOT,
+            "betas": np.full(10, 0.1 * n), "transl": Z_UP @ shown.pelvis[row] - SMPLX_ROOT,
         }  # fmt: skip
-        (folder / "SMPLX" / f"mesh-f{n:06d}_smplx.pkl").write_bytes(pickle.dumps(value))
+        (folder / "SMPLX" / f"mesh-f{first + row:05d}_smplx.pkl").write_bytes(pickle.dumps(value))
     return folder
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.body import BodyModel, Identity, Poses, write_identity, write_poses
 from pipeline.clip.camera import Camera
+from pipeline.clip.fit_quality import good_fit, write_fit_quality
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints, write_keypoints
 from pipeline.clip.plan import Plan, write_plan
@@ -57,5 +58,6 @@ def publish(
         write_keypoints(ingest / "keypoints.parquet", keypoints)
     write_identity(inputs["fit"] / "identity.safetensors", identity, body)
     write_poses(inputs["fit"] / "poses.parquet", poses)
+    write_fit_quality(inputs["fit"], good_fit(poses.frames))
     write_plan(inputs["plan"] / "plan.json", plan or plan_of())
     return inputs

@@ -5,6 +5,7 @@ import json
 
 import av
 import cv2
+import gsply
 import numpy as np
 import pytest
 import roma
@@ -20,6 +21,7 @@ from stages.animate.actor import PoseRange, legs_share
 from stages.animate.exr_layers import decode_srgb, exr_layers
 from stages.animate.run import on_background
 from tests.exr_reader import ffmpeg_colors, read_exr
+from tests.glb_reader import read_splat_glb
 from tests.made.body import open_body
 from tests.made.doll import awake_avatar, make_studio
 from tests.made.motions import FPS, made_up, write_npz
@@ -80,6 +82,17 @@ def test_only_what_is_asked_for_is_written(studio, walk):
     splats = studio.animate("splats", motion=str(walk), outputs=("ply",), last_frame=1)
     assert names(splats.output) == ["animate.json", "cameras.parquet", "frames.png", "ply"]
     assert names(splats.output / "ply") == ["000000.ply", "000001.ply"]
+
+
+def test_splats_of_all_formats_hold_the_same_gaussians(studio, walk):
+    context = studio.animate("formats", motion=str(walk), outputs=("ply", "spz", "glb"), last_frame=1)
+    for frame in ("000000", "000001"):
+        expected = read_ply(context.output / "ply" / f"{frame}.ply")
+        found = read_splat_glb(context.output / "glb" / f"{frame}.glb")
+        assert torch.allclose(found.means, expected.means) and torch.allclose(found.scales, expected.scales)
+        packed = gsply.read_spz(context.output / "spz" / f"{frame}.spz")
+        assert np.abs(packed.means - expected.means.numpy()).max() < 5e-5
+    assert {"ply", "spz", "glb"} < set(context.timings["milliseconds_a_frame"])
 
 
 def test_equal_runs_give_equal_bytes(studio, walk, everything):

@@ -274,6 +274,14 @@ def test_off_costs_nothing(full, tmp_path):
     assert not list(context.output.iterdir())
 
 
+def test_named_takes_what_is_named_and_nothing_in_its_place(full, tmp_path):
+    for named, generator in (({"weights": "w"}, "mimicmotion"), ({"folder": "f"}, "folder")):
+        context = context_for(full, tmp_path / generator, generator="named", **named)
+        assert stage.chosen_generator(context) == generator
+    with pytest.raises(UserError, match="auxiliary.weights"):
+        stage.run(context_for(full, tmp_path / "nothing", generator="named"))
+
+
 def test_auto_goes_by_the_plan(full, tmp_path):
     context = context_for(full, tmp_path / "auto", generator="auto")
     assert stage.chosen_generator(context) == "texture"

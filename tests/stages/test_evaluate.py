@@ -3,6 +3,7 @@ import io
 import json
 import re
 
+import gsply
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -17,6 +18,7 @@ from pipeline.errors import UserError
 from pipeline.metrics import PSNR_CAP
 from pipeline.orbit_cameras import relaxed_pose
 from stages.evaluate import STAGE
+from stages.evaluate.exports import avatar_rig
 from stages.evaluate.frame_metrics import Scorer
 from stages.evaluate.report.plots import plot_training, plot_visibility
 from stages.evaluate.report.terminal import show_summary
@@ -25,6 +27,7 @@ from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.upstream import VISIBILITY as VISIBILITY_READ
 from stages.evaluate.upstream import read_gate
 from stages.train.visibility_gate import SCHEMA as VISIBILITY
+from tests.glb_reader import Glb, read_splat_glb
 from tests.made.blob import (
     FRAMES,
     TEST,
@@ -33,6 +36,8 @@ from tests.made.blob import (
     stand_in,
     wrong,
 )
+from tests.made.body import BODY_FILE, open_body
+from tests.made.doll import awake_avatar
 from tests.ply_reader import read_ply
 
 
@@ -77,7 +82,8 @@ def worse(tmp_path_factory):
 def test_everything_named_is_published(published):
     names = {path.name for path in published.iterdir()}
     pictures = {"comparison.png", "cover.png", "turntable.mp4", "motion.mp4"}
-    assert names == {"metrics.parquet", "summary.json", "report.html", "avatar.ply", *pictures}
+    splats = {"avatar.ply", "avatar.spz", "avatar_splats.glb"}
+    assert names == {"metrics.parquet", "summary.json", "report.html", *splats, *pictures}
 
 
 def test_the_avatar_that_made_the_clip_scores_as_its_eight_bits_allow(published):
@@ -127,6 +133,26 @@ def test_the_ply_holds_the_turned_avatar(published):
     expected = stand_in(Pose(relaxed_pose(1.0), torch.zeros(4), torch.zeros(3)), None)
     upright = torch.tensor([1.0, -1.0, -1.0])  # viewers show -Y upright
     assert torch.allclose(found.means, upright * expected.means, atol=1e-6)
+
+
+def test_the_other_formats_hold_the_avatar_upright(published):
+    expected = stand_in(Pose(relaxed_pose(1.0), torch.zeros(4), torch.zeros(3)), None)
+    assert torch.allclose(read_splat_glb(published / "avatar_splats.glb").means, expected.means, atol=1e-6)
+    packed = gsply.read_spz(published / "avatar.spz")
+    assert np.abs(packed.means - expected.means.numpy()).max() < 5e-5
+
+
+def test_the_rig_is_published_and_the_report_states_sizes(tmp_path):
+    body, pose = open_body(), Pose(torch.zeros(55, 3), torch.zeros(38), torch.zeros(3))
+    rig = avatar_rig(awake_avatar(), body, BODY_FILE, pose)
+    output = make_clip(tmp_path).evaluate(rig=rig, glb_texture=32)
+    assert len(Glb(output / "avatar.glb").asset.skins[0].joints) == 55
+    files = json.loads((output / "summary.json").read_text())["files"]
+    assert set(files) == {"avatar.glb", "avatar.ply", "avatar.spz", "avatar_splats.glb"}
+    report = (output / "report.html").read_text()
+    for name, size in files.items():
+        assert size == (output / name).stat().st_size
+        assert f"{name}</code> ({size / 1e6:.2f} MB)" in report
 
 
 def test_the_same_inputs_give_the_same_bytes(published, clip):

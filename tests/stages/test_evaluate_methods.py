@@ -188,6 +188,22 @@ def test_a_face_that_the_render_lacks_is_counted(clip):
     assert means["identity_found"] == 0 and "identity_distance" not in means
 
 
+class Colours:
+    """Embeds a picture by its mean colour around the points."""
+
+    def embed(self, image, points):
+        (left, top), (right, bottom) = points.min(0).astype(int), points.max(0).astype(int) + 1
+        return image[top:bottom, left:right].reshape(-1, 3).mean(0) + 1.0
+
+
+def test_faces_are_compared_as_the_paper_does(clip):
+    output = clip.evaluate(arcface=Colours())
+    means = summary_of(output)["means"]["test"]
+    assert -1 <= means["nearest_frame"]["arcface_cosine"] < means["avatar"]["arcface_cosine"] <= 1
+    assert "arcface_cosine" not in means["mean_frame"]
+    assert f"{means['avatar']['arcface_cosine']:.4f}" in (output / "report.html").read_text()
+
+
 # Other cameras
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,16 +14,18 @@ from rich.console import Console
 
 from pipeline.body import Pose, read_poses, write_poses
 from pipeline.clip.camera import project
+from pipeline.clip.curves import Curve
 from pipeline.clip.frames import read_mask, write_mask
-from pipeline.clip.plan import write_plan
+from pipeline.clip.plan import Plan, write_plan
 from pipeline.config.evaluation_protocol import PROTOCOLS
 from pipeline.metrics import psnr
 from stages.evaluate.evaluated_clip import read_evaluated_clip
 from stages.evaluate.methods import AVATAR, AvatarMethod, pose_gradient_animation
+from stages.evaluate.refinement_allowance import allowance, is_asked_for
 from stages.evaluate.report.terminal import show_summary
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.summary import protocol_sentences
-from stages.evaluate.test_pose_refinement import NOT_REFINED, is_called_for, refine, refined_pose
+from stages.evaluate.test_pose_refinement import EFFECT, NOT_REFINED, frame_loss, refine, refined_pose
 from tests.made.blob import FRAMES, HEIGHT, TEST, WIDTH, make_clip, moving_poses, stand_in
 from tests.made.body import open_body
 from tests.made.plans import plan_of
@@ -59,7 +62,8 @@ def outputs(tmp_path_factory):
     displace(clip)
     write_plan(clip.inputs["plan"] / "plan.json", plan_of())
     off = clip.evaluate(name="off", follow=must_not_be_asked, refine_test_poses="off")
-    return off, *(clip.evaluate(name=name, refine_steps=30) for name in ("on", "again"))
+    asked = {"refine_test_poses": "on", "refine_steps": 30}
+    return off, *(clip.evaluate(name=name, **asked) for name in ("on", "again"))
 
 
 # The background
@@ -135,10 +139,43 @@ def test_equal_runs_give_equal_bytes(outputs):
 
 @pytest.mark.parametrize("asked", ["on", "off"])
 @pytest.mark.parametrize("planned", [True, False])
-def test_the_setting_overrules_the_plan(asked, planned):
+def test_settings_overrule_and_nothing_else_does(asked, planned):
     plan = plan_of(test_time_refinement=planned)
-    assert is_called_for(EvaluateSettings(refine_test_poses=asked), plan) == (asked == "on")
-    assert is_called_for(EvaluateSettings(), plan) == planned
+    assert is_asked_for(EvaluateSettings(refine_test_poses=asked), plan) == (asked == "on")
+    assert is_asked_for(EvaluateSettings(), plan) is None
+    decisions = [dataclasses.replace(one, forced=one.effect == EFFECT) for one in plan.decisions]
+    assert is_asked_for(EvaluateSettings(), Plan(tuple(decisions))) == planned
+
+
+# What it costs
+
+
+@pytest.mark.parametrize(
+    ("steps", "frames", "each"),
+    [(100_000, 3, 60), (1200, 3, 40), (300, 2, 12), (180, 1, 12), (20, 0, 0)],
+)
+def test_by_default_it_takes_a_share_of_the_work_of_training(clip, monkeypatch, steps, frames, each):
+    """First fewer steps, then fewer frames; the person's box is half of the picture."""
+    evaluated = clip.clip()
+    half = SimpleNamespace(width=WIDTH, height=HEIGHT / 2)
+    monkeypatch.setattr(type(evaluated), "person_box", lambda self, margin: half)
+    allowed = allowance(evaluated, EvaluateSettings(refine_share=0.2), None, steps)
+    assert (len(allowed.frames), allowed.steps) == (frames, each)
+    assert 2 * frames * each <= 0.2 * steps + 1
+    assert ("training" in allowed.why) == bool(frames)
+    asked = allowance(evaluated, EvaluateSettings(), True, steps)
+    assert (len(asked.frames), asked.steps) == (len(TEST), 60) and "%" in asked.why
+    assert not allowance(evaluated, EvaluateSettings(), False, steps).frames
+
+
+def test_both_numbers_stand_in_the_report_without_being_asked_for(clip):
+    displace(clip)
+    curve = Curve([(4000, "l1", 0.1)])
+    curve.write(clip.inputs["train"] / "curve.parquet")
+    output = clip.evaluate()
+    means = held_out(output)
+    assert means["avatar_refined"]["psnr"] > means["avatar"]["psnr"] + 2
+    assert summary_of(output)["refined"]["frames"] == len(TEST)
 
 
 def test_without_held_out_frames_nothing_is_refined(tmp_path):
@@ -243,6 +280,15 @@ def test_a_displaced_body_comes_back_and_the_networks_stay(painted):
     assert far > 2 and off_by(painted, animate, after) < far / 4
     assert {name: value.numpy().tobytes() for name, value in avatar.state_dict().items()} == networks
     assert all(weight.grad is None for weight in avatar.parameters())
+
+
+def test_a_further_loss_of_the_pictures_takes_part(painted):
+    animate, frame = pose_gradient_animation(painted_avatar()), painted.split.test[0]
+    losses = [
+        frame_loss(painted, animate, "black", frame, perceptual)(painted.pose(frame))
+        for perceptual in (None, lambda image, truth: 0.2 * (image - 1).abs().mean())
+    ]
+    assert float(losses[1].detach()) > float(losses[0].detach()) + 0.1
 
 
 def test_a_perfect_pose_is_left_alone(painted):

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from pipeline.body.joints import JOINT_NAMES
+from pipeline.motion.novel_motion import motion_poses
 from pipeline.orbit_cameras import relaxed_pose
 from pipeline.run.versions import PACKAGES, commit, package_version, versions
-from stages.evaluate.report.videos import motion_pictures, motion_poses
+from stages.evaluate.report.videos import motion_pictures
 from stages.evaluate.verdict import ClipCoverage, limits, quality, turned, verdict
 from tests.made.blob import stand_in
 
@@ -27,6 +28,8 @@ def summary(avatar=30.0, over=None, train=None, **methods):
     gains = {name: {"psnr": dict(zip(keys, each, strict=True))} for name, each in (over or {}).items()}
     for name in gains:
         means["test"].setdefault(name, {"psnr": avatar - gains[name]["psnr"]["mean"]})
+    if "avatar_refined" in methods:
+        gains["avatar_refined"] = {"psnr": {"mean": avatar - methods["avatar_refined"]}}
     return {"means": means, "differences": gains, "confidence": 0.95, "frames": {"test": 7}}
 
 

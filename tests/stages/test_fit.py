@@ -20,7 +20,7 @@ from stages.fit.registration import register
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from tests.made.context import stage_context
-from tests.made.detections import QUICK, SIZE, make_clip, problem_of, whole_body
+from tests.made.detections import QUICK, SIZE, make_clip, problem_of, true_poses, whole_body
 
 LEFT_ARM = ("left_shoulder", "left_elbow", "left_wrist")
 
@@ -151,6 +151,29 @@ def test_whole_body_points_alone_are_enough(model, clip):
     assert error[~error.isnan()].mean() < 2.0
 
 
+def test_expressions_are_as_many_as_the_setting_says(model):
+    clip = make_clip(*model, count=2, face=True)
+    fitted = register(*model, clip.keypoints, clip.cameras, FitSettings(iterations=1, expressions=7))
+    assert fitted.poses.expression.shape == (2, 7)
+    posed = pose_body(
+        model[0], fitted.identity, *(getattr(fitted.poses, n) for n in ("rotation", "expression", "transl"))
+    )
+    assert torch.isfinite(posed[0]).all()
+
+
+def test_whole_body_points_alone_have_a_face_to_align_with(model):
+    """L_sface is active, and the face counts as registered, without any face mesh."""
+    near = dataclasses.replace(make_clip(*model, count=4), poses=true_poses((3, 4, 5, 6), distance=1.6))
+    alone = whole_body(near, *model)
+    said, losses = [], []
+    for weight in (1.0, 0.0):
+        settings = FitSettings(iterations=2, lambda_sface=weight)
+        fitted = register(*model, alone.keypoints, alone.cameras, settings, log=said.append)
+        losses.append([value for _, name, value in fitted.curve.rows if name == "loss"][-1])
+    assert fitted.face_frames == 4 and "(points): fitted in 4 of 4" in said[0]
+    assert losses[0] > losses[1]
+
+
 def test_camera_of_its_own_moves_the_world_not_the_picture(model, clip):
     """A calibrated camera may stand anywhere: the fit is the same one, seen from there."""
     turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -201,8 +224,8 @@ def test_stage_publishes_its_files_twice_alike(tmp_path, model, ingest):
         run(context)
     files = sorted(path.name for path in contexts[0].output.iterdir())
     assert files == [
-        "curve.parquet", "face.json", "identity.safetensors", "overlay.mp4", "overlay.png", "poses.parquet",
-        "poses_raw.parquet", "residuals.parquet", "template.ply",
+        "curve.parquet", "face.json", "fit_quality.parquet", "identity.safetensors", "overlay.mp4",
+        "overlay.png", "poses.parquet", "poses_raw.parquet", "residuals.parquet", "template.ply",
     ]  # fmt: skip
     for name in files:
         first, second = ((context.output / name).read_bytes() for context in contexts)

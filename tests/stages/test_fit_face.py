@@ -8,7 +8,7 @@ import pytest
 import roma
 import torch
 
-from pipeline.clip.keypoints import empty_keypoints
+from pipeline.clip.keypoints import FACE, empty_keypoints
 from pipeline.numba_kernels import threads
 from stages.fit import terms
 from stages.fit.face import fit_face
@@ -248,4 +248,24 @@ def test_fit_face_says_what_it_did(model, face, clip):
     found, said = fitted(model, keypoints, clip.views, FitSettings())
     assert found is None and "no frame shows" in said[0]
     found, said = fitted(model, empty_keypoints(np.arange(40)), clip.views, FitSettings())
-    assert found is None and "no face mesh" in said[0]
+    assert found is None and "no frame shows" in said[0]
+
+
+def test_the_68_points_of_the_133_serve_where_there_is_no_mesh(model):
+    face = face_model(model[0], model[1].whole_body[FACE])
+    assert len(face.rows) == 68
+    clip = make_faces(face, count=40, noise=0.5)
+    keypoints = empty_keypoints(np.arange(40))
+    keypoints.whole_body[:, FACE, :2] = clip.mesh[..., :2]
+    keypoints.whole_body[:, FACE, 2] = 1
+    keypoints.whole_body[20, FACE, 2] = 0.1
+    found, said = fitted(model, keypoints, clip.views, FitSettings())
+    assert found.source == "points" and "(points): fitted in 39 of 40" in said[0]
+    assert not found.valid[20]
+    turned = roma.rotmat_geodesic_distance(found.orientation, clip.orientation)[found.valid]
+    assert turned.median() < 0.06 and turned.max() < 0.2
+    assert rms(found.neutral - face.mean) < 0.004
+    moved, truth = displacement(face, found.expression), displacement(face, clip.expression)
+    assert rms((moved - truth)[found.valid]) < 0.7 * rms(truth[found.valid])
+    terms_of = sface(face.mean, found)
+    assert all(float(value.mean()) > 0 for value in terms_of.values())

@@ -22,7 +22,7 @@ from stages.fit.face.target import aligned, face_model
 from stages.fit.observations import observe
 from stages.fit.settings import FitSettings
 from tests.made.detections import make_clip
-from tests.made.faces import flame_arrays
+from tests.made.faces import flame_arrays, write_deca
 from tests.made.fake_body import Trap
 
 
@@ -187,17 +187,6 @@ def test_another_head_than_the_bodys_is_said(model, face, flame):
 
 
 # DECA's files
-
-
-def write_deca(folder, frames, shape=10):
-    (folder / "flame_params").mkdir(parents=True)
-    (folder / "shape_param.json").write_text(json.dumps([0.5] * shape))
-    for frame, valid in frames.items():
-        values = {"expr": [0.1 * frame] * 50, "jaw_pose": [0.2, 0.0, 0.0]} if valid else {}
-        blank = dict.fromkeys(("root_pose", "neck_pose", "jaw_pose", "leye_pose", "reye_pose", "expr"))
-        content = {**blank, **values, "is_valid": valid}
-        (folder / "flame_params" / f"{frame}.json").write_text(json.dumps(content))
-    return folder
 
 
 def test_parameters_are_read_by_frame(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -24,6 +25,10 @@ from stages.fit.initialise_from_poses import given_identity
 from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from stages.ingest.run import run as run_ingest
+from stages.plan.decide import decide, face_registration
+from stages.plan.measure import read_inputs
+from stages.plan.settings import PlanSettings
+from stages.train.settings import TrainSettings, apply_plan
 from tests.made import layouts as writers
 from tests.made.body import BODY_FILE
 from tests.made.context import stage_context
@@ -71,6 +76,7 @@ def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, 
     assert surface_error(shown, output) < 1e-4
     names = {path.name for path in output.iterdir()}
     assert {
+        "fit_quality.parquet",
         "identity.safetensors",
         "poses.parquet",
         "template.ply",
@@ -83,8 +89,9 @@ def test_a_fitted_folder_is_published_as_it_is_and_training_can_begin(tmp_path, 
 
 def test_the_fit_starts_from_them(tmp_path, shown, ingested):
     """Without steps the start is published: it is the files', and not the estimator's."""
-    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_window=0)
-    ignored = fit(tmp_path / "ignore", ingested, given="ignore", iterations=0, smoothing_window=0)
+    started = fit(tmp_path / "start", ingested, given="start", iterations=0, smoothing_seconds=0.0)
+    only_start = {"iterations": 0, "smoothing_seconds": 0.0, "accept": "any"}
+    ignored = fit(tmp_path / "ignore", ingested, given="ignore", **only_start)
     wanted = shown.poses.rotation
     for output, near in ((started, True), (ignored, False)):
         found = read_poses(output / "poses.parquet").rotation
@@ -181,3 +188,15 @@ def test_mean_identity_stands_for_a_missing_shape(shown, ingested):
     assert torch.equal(found.betas, mean.betas) and torch.equal(found.face_offset, mean.face_offset)
     with pytest.raises(UserError, match="vertices"):
         given_identity(dataclasses.replace(record, face_offset=torch.zeros(10_475, 3)), shown.body, "nothing")
+
+
+def test_a_given_fit_counts_as_a_registered_face(tmp_path, ingested):
+    """So that the plan does not take lambda_face away from who brings fits."""
+    output = fit(tmp_path / "keep", ingested, given="keep")
+    record = json.loads((output / "face.json").read_text())
+    assert record["registered"] == record["frames"] == COUNT
+    inputs = read_inputs(ingested, output, BODY_FILE)
+    assert face_registration(inputs).on
+    plan = decide(inputs, PlanSettings())
+    assert "no face was registered" not in plan["face_loss"].why
+    assert apply_plan(TrainSettings(face=0.8), decide(inputs, PlanSettings(face_loss="on"))).face == 0.8

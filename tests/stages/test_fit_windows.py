@@ -88,7 +88,7 @@ def test_a_masked_frame_keeps_its_initial_pose_where_nothing_else_speaks(model):
     clip = make_clip(*model, count=3, gap=100)
     clip.keypoints.pose_image[1, :, 3] = 0.1
     clip.keypoints.pose_world[1, :, 3] = 0.1
-    settings = FitSettings(iterations=30, smoothness=0.0, smoothing_window=0)
+    settings = FitSettings(iterations=30, smoothness=0.0, smoothing_seconds=0.0)
     start = register(*model, clip.keypoints, clip.cameras, dataclasses.replace(settings, iterations=0))
     fitted = register(*model, clip.keypoints, clip.cameras, settings)
     moved = (fitted.poses.rotation - start.poses.rotation).norm(dim=-1).amax(1)

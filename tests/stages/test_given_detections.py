@@ -107,7 +107,7 @@ def test_given_points_are_fitted_whoever_gives_the_masks(folder: Path, monkeypat
     pretend = type("Pretend", (), {"__init__": lambda *_, **__: None, "estimate": lambda *_: seen})
     nobody = type("Nobody", (), {"__init__": lambda *_: None, "detect": lambda *_: []})
     monkeypatch.setattr("stages.ingest.detect.Estimator", pretend)
-    monkeypatch.setattr("stages.ingest.people.PersonDetector", nobody)
+    monkeypatch.setattr("stages.ingest.people_search.PersonDetector", nobody)
     write_json(folder / "keypoints", lambda number: person(0).tolist())
     given = {"keypoints": str(folder / "keypoints"), "masks": "mediapipe"}
     context = ingest_context(folder / "run", folder / "clip.mp4", {"mediapipe": folder}, **given)

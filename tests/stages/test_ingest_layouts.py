@@ -18,13 +18,12 @@ from scipy.spatial.transform import Rotation
 from pipeline.clip.camera import Camera, project
 from pipeline.clip.frames import read_frame, read_mask
 from pipeline.clip.keypoints import read_keypoints
-from pipeline.clip.records import read_cameras, read_footage, read_split
+from pipeline.clip.records import SHOT_STEP, read_cameras, read_footage, read_split
 from pipeline.errors import UserError
 from pipeline.pose_files import INITIAL_POSES, read_initial_poses, with_flat_hands
 from stages.fit.camera_batch import stack
 from stages.fit.initialise_from_poses import keep_given
 from stages.ingest.datasets.neuman import official_split
-from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
 from tests.made import layouts as writers
 from tests.made.body import BODY_FILE
@@ -176,7 +175,7 @@ def test_zju_as_one_video(tmp_path, shown, bend):
     folder = writers.zju(tmp_path / "my_377", shown, bend)
     frames = [5 * row for row in range(COUNT)]
     for extra in set(range(frames[-1] + 1)) - set(frames):  # every frame is read as a video
-        for kind in ("Camera_B1", "mask/Camera_B1"):
+        for kind in ("images/00", "mask/00"):
             suffix = "png" if kind.startswith("mask") else "jpg"
             source = folder / kind / f"{extra // 5 * 5:06d}.{suffix}"
             (folder / kind / f"{extra:06d}.{suffix}").write_bytes(source.read_bytes())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -81,10 +82,23 @@ def put(folder: Path, name: str, text: str) -> None:
     (folder / name).write_text(text)
 
 
+def text_heads(folder: Path, text: str) -> None:
+    """Expressions as text files in the place of the tracker's, one of which says ``text``."""
+    shutil.rmtree(folder / "checkpoint")
+    for number in range(1, COUNT + 1):
+        path = folder / "flame" / "exp" / f"{number:05d}.txt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text if number == 3 else "0.5\n" * 100)
+
+
 FAULTS = {  # (layout, file that must be named) -> what is done to the folder
     ("insta", "transforms.json"): lambda f: change_json(
         f / "transforms.json", lambda v: v["frames"][1].update(file_path="../../../etc/passwd1.png")
     ),
+    ("insta", "transforms.json names no"): lambda f: change_json(
+        f / "transforms.json", lambda v: v.update(frames=[])
+    ),
+    ("insta", "00003.txt"): lambda f: text_heads(f, "one two"),
     ("insta", "transforms_test.json"): lambda f: (f / "transforms_test.json").write_text('{"frames": 3}'),
     ("insta", "00002.frame"): lambda f: (f / "checkpoint" / "00002.frame").write_bytes(pickle.dumps(Evil())),
     ("wildavatar", "metadata.json"): lambda f: change_json(
@@ -108,8 +122,8 @@ FAULTS = {  # (layout, file that must be named) -> what is done to the folder
     ("xhumans", "cameras.npz"): lambda f: np.savez(
         f / "render" / "cameras.npz", intrinsic=np.eye(3), extrinsic=np.zeros((3, 3))
     ),
-    ("xhumans", "mesh-f000003_smplx.pkl"): lambda f: spoil_pickle(
-        f / "SMPLX" / "mesh-f000003_smplx.pkl", lambda v: v.pop("transl")
+    ("xhumans", "mesh-f00003_smplx.pkl"): lambda f: spoil_pickle(
+        f / "SMPLX" / "mesh-f00003_smplx.pkl", lambda v: v.pop("transl")
     ),
     ("persona", "frame_idx_list.txt"): lambda f: put(f / "captured", "frame_idx_list.txt", "1e9\n"),
     ("pose2sim", "Calib.toml"): lambda f: put(f / "calibration", "Calib.toml", "[cam_01]\nmatrix = 3\n"),

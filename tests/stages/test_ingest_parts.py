@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.clip.background import learn_background, subtract_background
 from pipeline.clip.keypoints import BODY, FACE, FACE_MESH_TO_IBUG68, FEET, LEFT_HAND, NAMES, RIGHT_HAND
 from pipeline.detection.mediapipe import estimator_scale
 from pipeline.detection.wholebody import PixelLandmarks, detour, score_faces, score_hands, to_keypoints
 from pipeline.errors import UserError
 from stages.ingest import people
-from stages.ingest.background import learn_background, subtract_background
 from stages.ingest.mask_edges import follow_edges
 from stages.ingest.mask_smoothing import smooth_masks
 from stages.ingest.masks import (
@@ -24,7 +24,7 @@ from stages.ingest.masks import (
     selfie_share,
     write_segmentations,
 )
-from stages.ingest.people import Person
+from stages.ingest.person_detector import Person
 from stages.ingest.split import split_frames
 from tests.made.videos import walking_blob
 

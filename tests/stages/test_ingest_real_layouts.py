@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from pipeline.clip.keypoints import read_keypoints
-from pipeline.clip.records import read_cameras, read_footage, read_split
+from pipeline.clip.records import SHOT_STEP, read_cameras, read_footage, read_split
 from pipeline.config.request import parse_request
 from pipeline.pose_files import INITIAL_POSES
 from pipeline.run.job import open_job
-from stages.ingest.datasets.recording import SHOT_STEP
 from stages.ingest.run import run
 from tests.made.videos import ingest_context
 

@@ -94,8 +94,6 @@ def test_a_setting_has_a_meaning_and_a_number_has_two_bounds_that_it_may_reach(s
     ("stage", "fields", "hint"),
     [
         ("ingest", {"mannequin": "head", "mannequin_motion": "fly"}, "no motion 'fly'"),
-        ("fit", {"smoothing_window": 4}, "fit.smoothing_window must be 0 or odd, from 3"),
-        ("fit", {"smoothing_window": 1}, "fit.smoothing_window must be 0 or odd, from 3"),
         ("fit", {"face": "flame"}, "fit.face=flame needs"),
         ("auxiliary", {"generator": "folder"}, "auxiliary.folder=FOLDER_OR_VIDEO"),
         ("auxiliary", {"generator": "mimicmotion"}, "auxiliary.weights=FOLDER"),

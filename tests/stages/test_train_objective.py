@@ -13,6 +13,7 @@ from stages.train.data import TrainingData
 from stages.train.initial_avatar import initial_avatar
 from stages.train.objective import TrainingObjective
 from stages.train.poses import PoseRefinement
+from stages.train.scene import read_scene
 from stages.train.settings import TrainSettings
 from tests.made.portrait import context_for, data_for
 
@@ -195,7 +196,7 @@ def test_lpips_begins_when_it_is_told_to(objective):
 
 def test_regularisers_with_a_weight_appear_and_others_cost_nothing(subject, tmp_path):
     whole = scene(subject, tmp_path / "whole", gate=False).objective
-    optional = {"hand_normal", "scale_size", "scale_growth", "hand_color", "arm_color"}
+    optional = {"hand_normal", "scale_size", "pose_scale", "scale_growth", "hand_color", "arm_color"}
     none = whole(scale_growth=0.0)(0, 0, False)
     every = whole(**dict.fromkeys(optional, 1.0))(0, 0, False)
     assert not optional & set(none) and optional <= set(every)
@@ -209,3 +210,23 @@ def test_term_that_lacks_what_it_needs_is_refused(objective):
         TrainingObjective(made.avatar, made.poses, bare, made.settings)
     with pytest.raises(ValueError, match="LPIPS"):
         TrainingObjective(made.avatar, made.poses, made.data, dataclasses.replace(made.settings, lpips=0.2))
+
+
+def test_the_whole_frame_is_compared_over_the_clips_own_background(subject, tmp_path):
+    made = scene(subject, tmp_path / "scene", gate=False)
+    clip, box = made.data.clip, made.data.crops.box
+    behind = read_scene(clip, box)
+    view = made.data.view(0)
+    assert behind.color.shape == view.color.shape and behind.confidence.shape == view.alpha.shape
+    known = (behind.confidence > 0) & (view.alpha == 0)
+    torch.testing.assert_close(behind.color[known], view.color[known], rtol=0, atol=0.03)
+    plain = made.objective()(0, 0, False)
+    over = dataclasses.replace(made, data=dataclasses.replace(made.data, scene=behind))
+    mixed = over.objective(scene_share=0.25)(0, 0, False)
+    assert "l1_scene" not in plain and "l1_scene" not in over.objective()(0, 0, False)
+    assert float(mixed["l1"].detach()) == pytest.approx(0.75 * float(plain["l1"].detach()), rel=1e-5)
+    assert 0 < float(mixed["l1_scene"].detach()) < 0.1
+    assert not {"l1_scene"} & set(over.objective(scene_share=0.25, generated=(0, 1, 2, 3, 4))(0, 0, False))
+    moved = dict(clip.cameras)
+    moved[1] = dataclasses.replace(moved[1], translation=moved[1].translation + 0.1)
+    assert read_scene(dataclasses.replace(clip, cameras=moved), box) is None

@@ -5,51 +5,16 @@ import torch
 
 from pipeline.body import edges, subdivide
 from pipeline.body.mesh import SMPLX_LIPS, SMPLX_VERTICES, close_mouth, face_normals
-
-RIM, EYE = 32, 546  # vertices on the rim of the hole, and of each eyeball
-
-
-def tube(first: int, rings: int, around: int) -> list[list[int]]:
-    """The triangles between ``rings`` rings of ``around`` vertices each."""
-    faces = []
-    for ring in range(rings - 1):
-        for k in range(around):
-            a, b = first + ring * around + k, first + ring * around + (k + 1) % around
-            faces += [[a, b, a + around], [b, b + around, a + around]]
-    return faces
-
-
-def cap(apex: int, ring: int, around: int) -> list[list[int]]:
-    return [[apex, ring + (k + 1) % around, ring + k] for k in range(around)]
-
-
-def made_faces() -> torch.Tensor:
-    """A sack with a hole of 32 edges and two closed eyeballs: 10,475 vertices, 20,908 triangles."""
-    faces: list[list[int]] = []
-    for eye in range(2):
-        low = eye * EYE
-        faces += tube(low, 34, 16) + cap(low + 544, low, 16) + cap(low + 545, low + 33 * 16, 16)
-    start, rings = 2 * EYE, 293
-    faces += tube(start, rings, RIM) + cap(start + rings * RIM, start + (rings - 1) * RIM, RIM)
-    for extra in range(start + rings * RIM + 1, SMPLX_VERTICES):  # into a triangle each
-        a, b, c = faces.pop()
-        faces[:0] = [[a, b, extra], [b, c, extra], [c, a, extra]]
-    return torch.tensor(faces)
+from tests.made.smplx_sized import lips_on_the_rim, made_faces
 
 
 @pytest.fixture(scope="module")
 def mesh() -> tuple[torch.Tensor, torch.Tensor]:
     """Vertices and faces; the lips lie on the rim, every fourth of it, in their order around it."""
-    faces, start = made_faces(), 2 * EYE
-    renamed = torch.arange(SMPLX_VERTICES)
-    for place, lip in enumerate(SMPLX_LIPS):
-        rim = start + 4 * place
-        old = int(torch.nonzero(renamed == lip)[0, 0])
-        renamed[old], renamed[rim] = renamed[rim].clone(), lip
     vertices = torch.randn(SMPLX_VERTICES, 3, generator=torch.Generator().manual_seed(0))
     angle = 2 * torch.pi * torch.arange(len(SMPLX_LIPS)) / len(SMPLX_LIPS)
     vertices[list(SMPLX_LIPS)] = torch.stack([angle.cos(), angle.sin(), torch.ones_like(angle)], 1)
-    return vertices, renamed[faces]
+    return vertices, lips_on_the_rim()[made_faces()]
 
 
 def test_numbers_of_smplx(mesh):

@@ -9,7 +9,7 @@ import torch
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.bake import bake
 from pipeline.avatar.completion import complete_avatar
-from pipeline.avatar.evidence import Evidence
+from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.body import Pose, load_body, mean_identity, part_labels, rest_joints
 from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import BODY, FACE, LEFT_HAND, NECK, RIGHT_HAND, SCALP, find_segments
@@ -110,6 +110,27 @@ def test_what_is_wholly_trusted_stays_to_the_byte(segments):
 def test_guessed_scales_cover(segments, front):
     scales = complete_log_scales(segments, np.full((len(segments), 3), -2.0), front)
     assert (np.median(scales[segments.normals[:, 2] < -0.9]) > -0.3) and (scales[front == 1] == -2).all()
+
+
+def test_guessed_scales_are_as_large_as_is_asked(segments, front):
+    scales = complete_log_scales(segments, np.zeros((len(segments), 3)), front, covers=0.3)
+    assert np.median(scales[segments.normals[:, 2] < -0.9]) > 0.25 and (scales[front == 1] == 0).all()
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.55, 0.75, 0.9])
+def test_no_light_passes_between_four_neighbours_that_cover(scale):
+    """On a square grid a cell's middle is the farthest from its corners."""
+    width = scale * np.exp(covering_log_scale(scale))
+    assert (1 - np.exp(-0.5 * (np.sqrt(0.5) / width) ** 2)) ** 4 < 0.02
+
+
+def test_a_jacket_s_back_is_like_its_sides_and_not_like_the_shirt_in_front(segments, front):
+    color, trunk = painted(segments), segments.is_in(BODY) & (segments.part == 0)
+    shirt = trunk & (np.abs(segments.around) < 0.6)
+    color[shirt] = [0.95, 0.95, 0.95]
+    found = complete_colors(segments, spoiled(color, front), front)
+    behind = trunk & (segments.normals[:, 2] < -0.7)
+    assert np.quantile(np.abs(found[behind] - CLOTH).max(1), 0.95) < 0.1
 
 
 def trained(representation: str) -> Avatar:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from pipeline.clip.background import Background
 from pipeline.clip.foreground import read_person
 from pipeline.clip.frames import write_frame, write_mask
-from stages.ingest.background import Background
 from stages.ingest.foreground import estimate_foreground, write_foreground
 
 PERSON, WALL = np.array([30.0, 40.0, 60.0]), np.array([240.0, 220.0, 200.0])

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline.avatar.avatar import LARGEST_SCALE
+from pipeline.avatar.posed import LARGEST_SCALE
 from pipeline.body import Pose
 from pipeline.numba_kernels import threads
 from tests.unit.test_avatar_representations import a_pose, an_avatar, half_gated

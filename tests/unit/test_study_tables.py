@@ -227,7 +227,7 @@ def test_an_ablation_is_written(tmp_path):
     assert len(pd.read_parquet(out / "table.parquet")) > 40
     told = headline(found)
     assert (
-        VARIANTS["fixed_threshold"].name.lower() in told.lower() and "-0.80 dB" in told and "2 of 7" in told
+        VARIANTS["fixed_threshold"].name.lower() in told.lower() and "-0.90 dB" in told and "2 of 8" in told
     )
 
 

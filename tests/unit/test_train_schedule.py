@@ -20,6 +20,21 @@ def test_rate_rises_then_falls_to_its_last_factor():
     assert rates[50] == pytest.approx(0.55)
 
 
+def test_rate_falls_in_steps():
+    settings = dataclasses.replace(SETTINGS, schedule="steps", warm_up=0)
+    rates = [schedule.rate_factor(settings, iteration) for iteration in range(100)]
+    assert rates == [1.0] * 75 + [0.1] * 20 + [0.01] * 5
+
+
+def test_residual_colours_come_in_evenly():
+    settings = dataclasses.replace(SETTINGS, residual_from=0.2, residual_ramp=0.1)
+    shares = [schedule.residual_share(settings, iteration) for iteration in (0, 20, 25, 30, 99)]
+    assert shares == pytest.approx([0, 0, 0.5, 1, 1])
+    assert schedule.residual_share(SETTINGS, 0) == 1
+    with pytest.raises(ValueError, match="residual_ramp"):
+        TrainSettings(residual_from=0.9, residual_ramp=0.2)
+
+
 @pytest.mark.parametrize(("fraction", "first"), [(0.0, 0), (0.4, 40), (1.0, None)])
 def test_fraction_of_the_run(fraction, first):
     begun = [schedule.begun(SETTINGS, fraction, iteration) for iteration in range(100)]

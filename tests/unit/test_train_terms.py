@@ -135,7 +135,9 @@ def test_face_triangles_are_those_of_the_face(canonical):
 
 
 def test_weights_follow_the_parts(canonical):
-    settings = TrainSettings(offset=1.0, offset_hands=2.0, offset_face=3.0, laplacian_color_hands=4.0)
+    settings = TrainSettings(
+        offset=1.0, offset_hands=2.0, offset_face=3.0, offset_scalp=5.0, laplacian_color_hands=4.0
+    )
     terms = {term.name: term for term in objective.TERMS}
     weights = {
         name: body_regions.weight_by_part(canonical, *terms[name].part_weights(settings))
@@ -144,7 +146,9 @@ def test_weights_follow_the_parts(canonical):
     hands, face = canonical.is_part("left_hand", "right_hand"), canonical.is_part("face")
     assert set(weights["offset"][hands].flatten().tolist()) == {2.0}
     assert set(weights["offset"][face].flatten().tolist()) == {3.0}
-    assert set(weights["offset"][~hands & ~face].flatten().tolist()) == {1.0}
+    scalp = canonical.is_part("head")
+    assert set(weights["offset"][scalp].flatten().tolist()) == {5.0}
+    assert set(weights["offset"][~hands & ~face & ~scalp].flatten().tolist()) == {1.0}
     assert set(weights["laplacian_color"][hands].flatten().tolist()) == {4.0}
     assert body_regions.find_regions(canonical, {}, arms=False).undersides is None
 
@@ -170,6 +174,8 @@ def test_lpips_is_asked_for_only_where_it_has_a_weight():
 
 def test_every_weight_of_the_settings_weighs_a_term():
     named = {name for term in objective.TERMS for name in (*term.weights, term.generated) if name}
+    counts = {term.times for term in objective.TERMS if term.times}
+    assert counts == {"l1_renderings", "renderings"}
     weights = {field.name for field in dataclasses.fields(TrainSettings) if field.type in ("Weight", Weight)}
     assert named == weights and len({term.name for term in objective.TERMS}) == len(objective.TERMS)
 
@@ -191,6 +197,10 @@ def test_terms_take_part_from_their_iteration_on_and_in_every_kth_draw():
     ]
     assert lpips.scalar_weight(settings, False) == pytest.approx(0.6)
     assert lpips.scalar_weight(settings, True) == pytest.approx(3 * settings.generated)
+    often = dataclasses.replace(settings, l1_renderings=6.5, renderings=2.0)
+    assert [terms["l1"].scalar_weight(often, made) for made in (False, True)] == [0.8 * 6.5, 0.1 * 2]
+    equal = dataclasses.replace(settings, generated_as_captured=True)
+    assert [terms[name].scalar_weight(equal, True) for name in ("l1", "ssim")] == [0.8, 0.2]
     assert terms["pose_offset"].first_iteration(settings) is None  # 1 stands for never
     assert terms["hand_normal"].first_iteration(settings) is None  # no weight
     weighted = TrainSettings(face=0.8)

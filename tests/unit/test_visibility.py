@@ -11,6 +11,7 @@ from pipeline.avatar.otsu_threshold import (
     fixed_threshold,
     histogram,
     otsu_threshold,
+    plain_threshold,
     share_below,
 )
 from pipeline.avatar.visibility import in_frame
@@ -108,3 +109,13 @@ def test_in_frame_is_inside_the_picture_and_before_the_camera():
         [[0.0, 0, -1], [0.45, 0, -1], [0.55, 0, -1], [0, 0.3, -1], [0, 0, 1], [0, 0, -0.1], [0, 0, 0]]
     )
     assert in_frame(camera, points).tolist() == [True, True, False, False, False, False, False]
+
+
+def test_plain_threshold_cuts_whatever_lies_under_it():
+    scores = np.concatenate([np.linspace(0, 1, 500), np.full(500, 1.0)])
+    assert not evidence_threshold(scores).closed
+    found = plain_threshold(scores)
+    assert (
+        found.closed and found.tau == found.otsu and found.cut == pytest.approx((scores < found.tau).mean())
+    )
+    assert not plain_threshold(np.ones(50)).closed

@@ -54,7 +54,7 @@ def _of_the_clip(footage: Footage) -> list[Omission]:
     dropped = [(reason, count) for reason, count in sorted(footage.dropped.items()) if count]
     found = [Omission(_count(count, "frame"), reason) for reason, count in dropped]
     if footage.people > 1:
-        why = f"{footage.people} people were noticed; the largest and most central one was followed"
+        why = f"{footage.people} people were noticed; one was followed, ingest.person chooses another"
         found.append(Omission("Other people", why))
     if footage.scale < 1:
         why = f"frames were stored at {footage.scale:.2f} of their size (ingest.long_side)"
@@ -120,13 +120,20 @@ def _of_the_poses(
         frames = ", ".join(map(str, refined.stopped))
         why = f"the loss of {frames} was not finite: shown in the pose of the fit, under both names"
         return [Omission("Refinement of " + _count(len(refined.stopped), "test pose"), why)]
-    if refined.poses or not split.test:
+    if refined.poses:
+        left = len(split.test) - len(refined.poses)
+        why = f"its cost is bounded by evaluate.refine_share={settings.refine_share:g}"
+        return [Omission(f"Refinement of {_count(left, 'held-out pose')}", why)] if left else []
+    if not split.test:
         return []
     asked = settings.choices.refine_test_poses
     named = (
         "refine_test_poses=off" if settings.refine_test_poses == asked else f"protocol={settings.protocol}"
     )
-    reason = plan[EFFECT].why if asked == PLAN else f"evaluate.{named}"
+    bounded = (
+        f"{plan[EFFECT].why}; evaluate.refine_share={settings.refine_share:g} of training's work allows none"
+    )
+    reason = f"evaluate.{named}" if asked != PLAN else plan[EFFECT].why if plan[EFFECT].forced else bounded
     why = (
         "held-out frames are shown in the pose that the fit found from their keypoints, not their pixels: "
         + reason

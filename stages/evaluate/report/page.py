@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import jinja2
 import numpy as np
 
 from pipeline.clip.plan import Decision
+from pipeline.viewer.page import script_hash, viewer_fragment, viewer_script
 from stages.evaluate.report import tables
 from stages.evaluate.report.omissions import Omission
 from stages.evaluate.report.pictures import Closeup, Comparison
@@ -53,6 +53,7 @@ class ReportContents:
         stages: upstream first.
         versions: what made the result, name -> version.
         turned: the avatar from all sides, where it was looked at.
+        packed: the avatar for the interactive part, as ``pipeline.viewer.packed`` writes it.
     """
 
     summary: Mapping[str, Any]
@@ -75,6 +76,7 @@ class ReportContents:
     stages: Sequence[StageRecord]
     versions: Mapping[str, str]
     turned: Turned | None = None
+    packed: bytes | None = None
 
 
 def write_report(path: Path, contents: ReportContents) -> None:
@@ -91,7 +93,8 @@ def write_report(path: Path, contents: ReportContents) -> None:
 def _template_values(contents: ReportContents) -> dict[str, Any]:
     """The contents by their names, what is embedded of them, and the tables that the summary fills."""
     summary, stages = contents.summary, contents.stages
-    script = (Path(__file__).parent / _SCRIPT).read_text(encoding="utf-8")
+    scripts = [(Path(__file__).parent / _SCRIPT).read_text(encoding="utf-8")]
+    scripts += [] if contents.packed is None else [viewer_script()]
     return {
         **vars(contents),
         "held_out": HELD_OUT in summary["means"],
@@ -108,14 +111,10 @@ def _template_values(contents: ReportContents) -> dict[str, Any]:
         "visibility_picture": _embedded([contents.visibility_picture]),
         "total": sum(stage.seconds or 0.0 for stage in stages),
         "peak": max((stage.memory for stage in stages if stage.memory), default=None),
-        "script": script,
-        "script_hash": script_hash(script),
+        "viewer": "" if contents.packed is None else viewer_fragment(contents.packed),
+        "scripts": scripts,
+        "script_hashes": [script_hash(one) for one in scripts],
     }
-
-
-def script_hash(script: str) -> str:
-    """The hash by which the page's policy admits this script and no other."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
 
 
 def _embedded(candidates: Sequence[Path]) -> dict[str, str] | None:

@@ -32,12 +32,13 @@ METRIC_LABELS = {
     "identity_distance": "face distance",
     "identity_cosine": "face cosine",
     "identity_found": "faces found",
+    "arcface_cosine": "ArcFace's cosine (FC)",
 }
 
-_DECIMALS = {"ssim": 4, "identity_cosine": 3, "identity_distance": 3}  # all others: 2
+_DECIMALS = {"ssim": 4, "identity_cosine": 3, "identity_distance": 3, "arcface_cosine": 4}  # all others: 2
 
 REGION_METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg")
-CONSISTENCY = ("flicker", "identity_distance", "identity_cosine", "identity_found")
+CONSISTENCY = ("flicker", "identity_distance", "identity_cosine", "identity_found", "arcface_cosine")
 
 _COMPOSITES = {
     "psnr_black_own": "on black, its own alpha",

@@ -1,4 +1,6 @@
-"""The face first from the estimator's 3D face mesh: the default source, which needs no other model.
+"""The face first from the estimator's own points: the default source, which needs no other model.
+
+They are MediaPipe's 3D mesh, or the 68 face points of the 133, which have no depth.
 
 Heads and expressions of single frames (``head_poses``) alternate with the clip's neutral face
 (``neutral``), which is learnt from at most 96 frames spread over the clip, so that long clips cost no more;
@@ -9,6 +11,7 @@ estimator exaggerates depth.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
@@ -21,6 +24,7 @@ from stages.fit.face.head_poses import (
     linearise,
     solve,
     start,
+    start_without_depth,
 )
 from stages.fit.face.neutral import Modes, smooth_modes, solve_neutral
 from stages.fit.face.target import FaceModel, FaceTarget, make_target
@@ -33,42 +37,50 @@ _FIRST_NOISE = 0.02  # of the face's size in pixels, before anything is known
 _LEAST_NOISE = 0.3  # pixels
 _MISFIT, _BLUR = 0.2, 1.0  # of the face's size, and pixels: a frame that fits no better shows something else
 _GAIN = (0.6, 1.6)
+_FLAT = {"depth_noise": math.inf, "together": 1.0}  # of points without depth, which stand far apart
 
 
 def face_from_mesh(model: FaceModel, mesh: Tensor, mask: Tensor, views: CameraBatch) -> FaceTarget | None:
-    """Fit a face to the estimator's face meshes.
+    """Fit a face to the estimator's face meshes, or to points that have no depth.
 
     Args:
         model: the body's face, F points.
-        mesh: [T, F, 3], x, y, z of these points in pixels, z relative and larger farther away.
+        mesh: [T, F, 3], x, y, z of these points in pixels, z relative and larger farther away; or [T, F, 2].
         mask: [T, F] bool, which of them to trust.
 
     Returns:
         None where no frame shows enough of a face.
     """
-    observed = FaceObservations(
-        mesh[..., :2] - views.centre[:, None], mesh[..., 2], mask.float(), views.focal
-    )
+    deep = mesh.shape[-1] == 3
+    depth = mesh[..., 2] if deep else torch.zeros_like(mesh[..., 0])
+    observed = FaceObservations(mesh[..., :2] - views.centre[:, None], depth, mask.float(), views.focal)
     valid = (observed.mask.mean(1) >= _SEEN) & torch.isfinite(mesh * observed.mask[..., None]).all((1, 2))
     if not valid.any():
         return None
     rows = torch.nonzero(valid)[:, 0]
     chosen = rows[torch.linspace(0, len(rows) - 1, min(len(rows), _LEARNT_FROM)).round().long()]
-    neutral, quality = _learn(model, smooth_modes(model), observed.frames(chosen))
+    neutral, quality = _learn(model, smooth_modes(model), observed.frames(chosen), deep)
     seen = observed.frames(rows)
     noise = quality.noise.median() / _sizes(observed.frames(chosen)).median() * _sizes(seen)
-    quality = ObservationQuality(noise, quality.gain)
-    heads = solve(model, neutral, seen, start(model, seen), quality, steps=4)
+    quality = dataclasses.replace(quality, noise=noise)
+    heads = solve(model, neutral, seen, _start(model, seen, deep), quality, steps=4)
     fits = _misfit(model, neutral, seen, heads, quality) < _MISFIT * _sizes(seen) + _BLUR
     if not fits.any():
         return None
-    return _handed_on(model, neutral, heads, rows, fits, views)
+    return _handed_on(model, neutral, heads, (rows, fits), views, "mesh" if deep else "points")
 
 
-def _learn(model: FaceModel, modes: Modes, observed: FaceObservations) -> tuple[Tensor, ObservationQuality]:
+def _start(model: FaceModel, observed: FaceObservations, deep: bool) -> HeadPoses:
+    return start(model, observed) if deep else start_without_depth(model, observed)
+
+
+def _learn(
+    model: FaceModel, modes: Modes, observed: FaceObservations, deep: bool
+) -> tuple[Tensor, ObservationQuality]:
     """The neutral face, and the quality of the observations that it was learnt from."""
-    neutral, heads = model.mean, start(model, observed)
-    quality = ObservationQuality(_FIRST_NOISE * _sizes(observed))
+    neutral, heads = model.mean, _start(model, observed, deep)
+    noise = _FIRST_NOISE * _sizes(observed)
+    quality = ObservationQuality(noise) if deep else ObservationQuality(noise, **_FLAT)
     for _ in range(_ROUNDS):
         heads = solve(model, neutral, observed, heads, quality, steps=2)
         if len(observed.mask) >= _RESTS_WITHIN:
@@ -111,6 +123,8 @@ def _quality(
     sizes = _sizes(observed)
     relative = (off / sizes[:, None].expand_as(observed.mask)[trusted][:, None]).median()
     noise = (relative * sizes).clamp_min(_LEAST_NOISE)
+    if not quality.has_depth:
+        return dataclasses.replace(quality, noise=noise)
     posed = (linear.posed @ heads.rotation.mT)[..., 2]
     predicted = posed * (observed.focal[:, :1] / heads.place[:, 2:].clamp_min(0.05))
     weight = linear.weight / sizes[:, None].square()
@@ -120,7 +134,7 @@ def _quality(
     ]
     predicted, found = predicted - mean[0], observed.depth - mean[1]
     gain = float((weight * predicted * found).sum() / (weight * predicted.square()).sum().clamp_min(1e-9))
-    return ObservationQuality(noise, min(max(gain, _GAIN[0]), _GAIN[1]))
+    return dataclasses.replace(quality, noise=noise, gain=min(max(gain, _GAIN[0]), _GAIN[1]))
 
 
 def _misfit(
@@ -147,9 +161,15 @@ def _sizes(observed: FaceObservations) -> Tensor:
 
 
 def _handed_on(
-    model: FaceModel, neutral: Tensor, heads: HeadPoses, rows: Tensor, fits: Tensor, views: CameraBatch
+    model: FaceModel,
+    neutral: Tensor,
+    heads: HeadPoses,
+    chosen: tuple[Tensor, Tensor],
+    views: CameraBatch,
+    source: str,
 ) -> FaceTarget:
-    """The fitted rows of the clip, spread over all of its frames."""
+    """The frames that were solved, of which some fit, spread over all of the clip's."""
+    rows, fits = chosen
     count, fitted = len(views.focal), rows[fits]
     valid = torch.zeros(count, dtype=torch.bool)
     valid[fitted] = True
@@ -159,4 +179,4 @@ def _handed_on(
     jaw[fitted, 0] = heads.jaw[fits]
     orientation = torch.eye(3).repeat(count, 1, 1)
     orientation[fitted] = views.rotation[fitted].mT @ heads.rotation[fits]
-    return make_target(model, neutral, expression, jaw, valid, "mesh", orientation)
+    return make_target(model, neutral, expression, jaw, valid, source, orientation)

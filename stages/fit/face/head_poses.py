@@ -1,8 +1,8 @@
 """One face in every frame: where the head is, how far the mouth is open, and the expression.
 
-Gauss-Newton on the face's 478 points as they are seen through the frame's own pinhole, all frames of a
-chunk at once. Unknown in a frame are the head's rotation R and place t in the camera's axes, the jaw's
-angle a about its hinge (X), psi, and the origin of the estimator's depths:
+Gauss-Newton on the face's points (478 of a mesh, or 68 without depth) as they are seen through the frame's
+own pinhole, all frames of a chunk at once. Unknown in a frame are the head's rotation R and place t in the
+camera's axes, the jaw's angle a about its hinge (X), psi, and the origin of the estimator's depths:
 
     y_i = B_i(a) (n_i + E_i psi - j) + j,   B_i(a) = 1 + w_i (R_x(a) - 1)
     pixel_i = project(R y_i + t),           depth_i = gain * focal * (R y_i + t)_z / distance + origin
@@ -13,6 +13,7 @@ The jaw is a joint of the body and no expression, so it has an unknown of its ow
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import roma
 import torch
@@ -42,7 +43,7 @@ class FaceObservations:
 
     Attributes:
         pixels: [T, F, 2], relative to the principal point.
-        depth: [T, F], in pixels, relative, larger farther away.
+        depth: [T, F], in pixels, relative, larger farther away; anything where no depth is known.
         mask: [T, F], 1 where a point is to be trusted.
         focal: [T, 2], pixels.
     """
@@ -83,10 +84,23 @@ class ObservationQuality:
     Attributes:
         noise: [T], pixels, standard deviation of x and y.
         gain: the estimator's depths over true ones.
+        depth_noise: noise of the depths over that of x and y; infinite where none are known.
+        together: weight of a point, less than 1 where neighbouring ones err together.
     """
 
     noise: Tensor
     gain: float = 1.0
+    depth_noise: float = DEPTH_NOISE
+    together: float = TOGETHER
+
+    @property
+    def has_depth(self) -> bool:
+        """True where the estimator tells depths."""
+        return math.isfinite(self.depth_noise)
+
+    def frames(self, rows: Tensor | slice) -> ObservationQuality:
+        """The quality of some of the frames."""
+        return dataclasses.replace(self, noise=self.noise[rows])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +139,33 @@ def start(model: FaceModel, observed: FaceObservations) -> HeadPoses:
     return HeadPoses(rotation, place, zeros[:, :1].sum(1), zeros, shift[:, 2])
 
 
+def start_without_depth(model: FaceModel, observed: FaceObservations) -> HeadPoses:
+    """Heads by the scaled orthographic camera that fits best the points of the skull.
+
+    The affine map from the mean face to the pixels is found by least squares; the rotation is the nearest to
+    its two rows, the third follows from them. In a frame that shows nothing the head faces the camera.
+    """
+    weights = observed.mask * rigidity(model)
+    total = weights.sum(1, keepdim=True).clamp_min(1e-9)
+    centre = (weights / total) @ model.mean  # [T, 3]
+    middle = (observed.pixels * (weights / total)[..., None]).sum(1)
+    places = (model.mean - centre[:, None]) * weights.sqrt()[..., None]
+    pixels = (observed.pixels - middle[:, None]) * weights.sqrt()[..., None]
+    spread = places.mT @ places
+    spread = spread + 1e-6 * torch.eye(3, dtype=spread.dtype)  # metres squared: a millimetre
+    affine = torch.linalg.solve(spread, places.mT @ pixels).mT  # [T, 2, 3]
+    upright = torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    affine = torch.where((affine.norm(dim=(1, 2)) > 1e-3)[:, None, None], affine, upright)
+    left, sizes, right = torch.linalg.svd(affine, full_matrices=False)
+    rows = left @ right
+    rotation = torch.cat([rows, torch.linalg.cross(rows[:, 0], rows[:, 1])[:, None]], dim=1)
+    distance = observed.focal.mean(1) / sizes.mean(1).clamp_min(1e-3)
+    ahead = torch.cat([middle / observed.focal * distance[:, None], distance[:, None]], dim=1)
+    place = ahead - (rotation @ centre[..., None])[..., 0]
+    zeros = place.new_zeros(len(place), model.expression.shape[2])
+    return HeadPoses(rotation, place, zeros[:, :1].sum(1), zeros, place.new_zeros(len(place)))
+
+
 def rigidity(model: FaceModel) -> Tensor:
     """The rigidity of each point in the skull: [F], 1 for the bridge of the nose, near 0 for the lips."""
     moves = model.expression.square().sum((1, 2)).sqrt() / 0.004
@@ -151,7 +192,7 @@ def solve(
     for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
         part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
-        seen, known = observed.frames(rows), ObservationQuality(quality.noise[rows], quality.gain)
+        seen, known = observed.frames(rows), quality.frames(rows)
         for _ in range(steps):
             part = _step(model, linearise(model, neutral, seen, part, known), part, known)
         done.append(part)
@@ -178,7 +219,7 @@ def linearise(
     per_metre = quality.gain * focal[..., :1] / distance
     depth = per_metre * (seen[..., 2:] - heads.place[:, None, 2:]) + heads.origin[:, None, None]
     found = torch.cat([observed.pixels, observed.depth[..., None]], dim=-1)
-    sigma = torch.stack([quality.noise, quality.noise, DEPTH_NOISE * quality.noise], dim=1)[:, None]
+    sigma = torch.stack([quality.noise, quality.noise, quality.depth_noise * quality.noise], dim=1)[:, None]
     residual = (found - torch.cat([pixels, depth], dim=-1)) / sigma
     weight = observed.mask / (1 + residual.square().mean(-1) / _OUTLIER).square()
     camera = seen.new_zeros(*seen.shape, 3)
@@ -193,7 +234,7 @@ def _step(
 ) -> HeadPoses:
     """One damped Gauss-Newton step; priors on the jaw and psi are part of the normal equations."""
     jacobian = _jacobian(model, linear, heads, quality)  # [T, F, 3, P]
-    weighted = jacobian * (TOGETHER * linear.weight)[..., None, None]
+    weighted = jacobian * (quality.together * linear.weight)[..., None, None]
     flat = weighted.flatten(1, 2).mT  # [T, P, 3F]
     normal = (flat @ jacobian.flatten(1, 2)).double()
     right = (flat @ linear.residual.flatten(1)[..., None])[..., 0].double()
@@ -226,7 +267,7 @@ def _jacobian(
     place = linear.camera.clone()
     place[..., 2, :] = 0
     origin = torch.zeros_like(linear.residual)
-    origin[..., 2] = (1 / (DEPTH_NOISE * quality.noise))[:, None]
+    origin[..., 2] = (1 / (quality.depth_noise * quality.noise))[:, None]
     swing = torch.linalg.cross(axes[..., 0, :], linear.posed - model.jaw_joint)
     jaw = in_camera @ (model.jaw_weight[:, None] * swing)[..., None]
     # A product a point over all frames: one a point and frame is many times slower.

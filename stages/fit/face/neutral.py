@@ -14,7 +14,6 @@ from torch import Tensor
 
 from stages.fit.face.head_poses import (
     CHUNK,
-    TOGETHER,
     FaceObservations,
     HeadPoses,
     ObservationQuality,
@@ -70,11 +69,9 @@ def solve_neutral(
     for begin in range(0, len(observed.mask), CHUNK):
         rows = slice(begin, begin + CHUNK)
         part = HeadPoses(*(getattr(heads, f.name)[rows] for f in dataclasses.fields(HeadPoses)))
-        linear = linearise(
-            model, neutral, observed.frames(rows), part, ObservationQuality(quality.noise[rows], quality.gain)
-        )
+        linear = linearise(model, neutral, observed.frames(rows), part, quality.frames(rows))
         jacobian = linear.camera @ linear.blend
-        weighted = jacobian.mT * (TOGETHER * linear.weight)[..., None, None]
+        weighted = jacobian.mT * (quality.together * linear.weight)[..., None, None]
         normal += (weighted @ jacobian).sum(0)
         right += (weighted @ linear.residual[..., None])[..., 0].sum(0)
     offset = neutral - model.mean

@@ -31,7 +31,8 @@ class FaceTarget:
     """A face fitted first, over T frames.
 
     Attributes:
-        rows: [F] int64, ascending, which of the 478 face-mesh landmarks it speaks of; all lie on skin.
+        rows: [F] int64, ascending, which of the face's landmarks (478 of the mesh, or 68) it speaks of; all
+            lie on skin.
         points: the same F points on the body.
         neutral: [F, 3], metres in the head joint's frame at rest, without expression, mouth shut.
         faces: [K, 3] int64, triangles between the F points.
@@ -42,7 +43,7 @@ class FaceTarget:
         orientation: [T, 3, 3], the head's rotation from rest to the world; None where the source does
             not say it, the identity where not valid.
         valid: [T] bool, whether a face was fitted in the frame.
-        source: ``mesh`` or ``flame``.
+        source: ``mesh``, ``points`` (68, without depth) or ``flame``.
     """
 
     rows: Tensor
@@ -63,7 +64,7 @@ class FaceModel:
     """The body's face at its landmarks, as much as a face alone needs.
 
     Attributes:
-        rows: [F], which of the 478 landmarks; points: the same on the body.
+        rows: [F], which of the face's landmarks; points: the same on the body.
         mean: [F, 3], metres in the head joint's frame at rest, of the mean body.
         expression: [F, 3, E], metres a unit of psi.
         jaw_weight: [F], how much of the jaw's rotation each point follows.
@@ -90,10 +91,10 @@ class FaceModel:
         )  # fmt: skip
 
 
-def face_model(body: BodyModel, face_mesh: PointSet) -> FaceModel:
-    """The face of a body at those of its 478 face-mesh landmarks that lie on skin."""
-    rows = torch.nonzero(on_skin(body, face_mesh))[:, 0]
-    points = face_mesh[rows]
+def face_model(body: BodyModel, landmarks: PointSet) -> FaceModel:
+    """The face of a body at those of its landmarks, 478 of the face mesh or 68, that lie on skin."""
+    rows = torch.nonzero(on_skin(body, landmarks))[:, 0]
+    points = landmarks[rows]
     joints = rest_joints(body, mean_identity(body))
     head = joints[joint_index("head")]
     share = points.barycentrics

@@ -3,37 +3,38 @@
 ::
 
     images/00012.png                  RGBA; the alpha is the person
-    alpha/00012.png                   where FATE's: taken in its place
+    alpha/00012.png                   FATE's mask, clothes in it; taken where images/ has no alpha
     transforms{,_train,_test}.json    frames [{file_path, transform_matrix, ...}]; cx cy fl_x fl_y w h
     checkpoint/00012.frame            torch file: flame {exp, jaw, eyes, ...}, opencv {R, t, K}, img_size
+    flame/exp/00012.txt               expression, a number a line; flame/{jaw,eyes} where FATE's
 
-Source: INSTA (Zielon/INSTA, scripts/transforms.py), RGBAvatar and FATE. transform_matrix is camera-to-world
-with OpenGL's axes (x right, y up, z towards the viewer), as instant-ngp takes it: the second and third
-columns change sign to become OpenCV's, and the inverse is world-to-camera. The world is the head's own, in
-metres, so each frame has a camera of its own. Where there is no transforms.json, the camera of the .frame
-files stands still and opencv R, t is the head in it.
+Source: INSTA (Zielon/INSTA, scripts/transforms.py), FATE (train/dataset.py) and RGBAvatar. transform_matrix
+is camera-to-world: the inverse of the tracker's opencv R, t as it stands, so its axes are OpenCV's. Some
+programs write the same file with OpenGL's axes (y up, z towards the viewer), as instant-ngp has it. The
+world is the head's own, with its origin in the head, and a head that was filmed lies before the camera:
+where the origin's depth is negative in OpenCV's axes, they are OpenGL's, and the second and third columns
+change sign. Metres; each frame has a camera of its own. Where there is no transforms.json, the camera of
+the .frame files stands still and opencv R, t is the head in it.
 
-FLAME's numbers start the fit: expression (FLAME's first coefficients are what SMPL-X's expressions are built
-from), and the rotations of jaw and eyes, rotation vectors or the first two ROWS of a matrix (pytorch3d's six
-numbers), left eye first. The body is given the head's direction; its place is left to the keypoints, since
-FLAME's origin is no joint of SMPL-X.
+FLAME's numbers start the fit, see ``insta_heads``. The body is given the head's direction; its place is
+left to the keypoints, since FLAME's origin is no joint of SMPL-X.
 
 With transforms_train.json and transforms_test.json the split is theirs; ``ingest.test_frames=350`` is that of
-the paper and of RGBAvatar.
+the paper and of RGBAvatar. A folder of GaussianAvatars (VHAP's export) has a transforms.json, too, of several
+cameras and with FLAME in ``flame_param/``; it is none of INSTA's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pipeline.clip.frame_files import match_names, number_files
 from pipeline.errors import UserError
-from pipeline.pose_files import InitialPoses
-from pipeline.untrusted import inside, parse_json, read_torch
+from pipeline.untrusted import inside, parse_json
 from stages.ingest.cameras.calibration import (
     EVERY_FRAME,
     CalibratedCamera,
@@ -41,6 +42,7 @@ from stages.ingest.cameras.calibration import (
     check_rotation,
     pinhole_lens,
 )
+from stages.ingest.datasets.insta_heads import TrackedHead, poses_of, read_texts, read_tracker
 from stages.ingest.datasets.recording import (
     Recording,
     Shot,
@@ -50,73 +52,134 @@ from stages.ingest.datasets.recording import (
     pinhole_of_matrix,
     read_array,
 )
-from stages.ingest.datasets.smplx_poses import initial_poses
+from stages.ingest.mask_files import has_own_alpha
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import PICTURES, Clip, clip_frames, folder_clip
 
 _REMEDY = "unpack the INSTA subject again"
+_GAUSSIAN_AVATARS = ("flame_param", "canonical_flame_param.npz")
 _FLIP = np.diag([1.0, -1.0, -1.0])
-_FRAME_BYTES = 64 << 20
+_SAME_SIDE = 0.9  # share of the frames whose head must be on one side of the camera
 
 
 def recognises(folder: Path) -> bool:
-    """Images with a tracker's files."""
+    """Images with the metrical tracker's files."""
     tracked = (folder / "transforms.json").is_file() or (folder / "checkpoint").is_dir()
-    return (folder / "images").is_dir() and tracked
+    return (folder / "images").is_dir() and tracked and not _of_gaussian_avatars(folder)
 
 
 def read(source: Path, settings: IngestSettings) -> Recording:
     """Read an actor's folder; UserError where a file of it is malformed."""
+    if _of_gaussian_avatars(source):
+        raise _another_layout(source)
     pictures = number_files(source / "images", PICTURES)
     clip = folder_clip(source / "images", pictures, 25.0)
-    tracked = files_of(source / "checkpoint", clip, (".frame",)) or {}
-    heads = {frame: _head(path) for frame, path in tracked.items()}
-    path = source / "transforms.json"
+    heads = read_tracker(source, clip)
+    path, notes = source / "transforms.json", []
     if path.is_file():
-        views = _views(source, parse_json(path, _REMEDY), path, clip)
+        table = parse_json(path, _REMEDY)
+        if any("flame_param_path" in frame for frame in _frames(table, path) if isinstance(frame, dict)):
+            raise _another_layout(source)
+        views, axes = _views(source, table, path, clip)
+        notes.append(f"its cameras have {axes}'s axes")
+        heads = heads or read_texts(source, clip, views)
         calibration = Calibration(path, "INSTA", views, metric=True, upright=False, by_frame=True)
     elif heads:
-        lens = pinhole_of_matrix(next(iter(heads.values()))["K"], clip, source / "checkpoint", _REMEDY)
-        still = CalibratedCamera(lens, np.eye(3), np.zeros(3))
-        calibration = Calibration(path, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
+        calibration = _tracked_camera(source, heads, clip)
     else:
         raise UserError(f"{source} has neither transforms.json nor checkpoint/*.frame: {_REMEDY}")
-    masks = files_of(source / "alpha", clip)
-    shot = Shot(clip, calibration, None, masks, "white", _poses(heads))
-    return Recording("insta", (shot,), _listed(source, "train", clip), _listed(source, "test", clip))
+    masks = None
+    if not has_own_alpha(pictures):
+        masks = files_of(source / "alpha", clip)
+        notes += [] if masks else ["no masks, neither in images/ as alpha nor in alpha/"]
+    notes += [] if heads else ["no expressions, neither in checkpoint/ nor in flame/exp/"]
+    shot = Shot(clip, calibration, None, masks, "white", poses_of(heads))
+    split = [_listed(source, part, clip) for part in ("train", "test")]
+    return Recording("insta", (shot,), *split, notes=tuple(notes))
 
 
-def _views(source: Path, table: Any, path: Path, clip: Clip) -> dict[str, CalibratedCamera]:
-    """Frame number -> camera."""
+def _another_layout(source: Path) -> UserError:
+    return UserError(
+        f"{source} is a folder of GaussianAvatars (FLAME in npz files, several cameras), not of INSTA: "
+        "give one camera's pictures as a folder of their own, with ingest.layout=plain"
+    )
+
+
+def _frames(table: Any, path: Path) -> list[Any]:
+    """The entries of a transforms file."""
+    frames = entry(table, "frames", path, _REMEDY)
+    if not isinstance(frames, list):
+        raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
+    return frames
+
+
+def _of_gaussian_avatars(folder: Path) -> bool:
+    return any((folder / name).exists() for name in _GAUSSIAN_AVATARS)
+
+
+def _tracked_camera(source: Path, heads: Mapping[int, TrackedHead], clip: Clip) -> Calibration:
+    """The still camera of ``checkpoint/``."""
+    folder = source / "checkpoint"
+    matrix = next(iter(heads.values())).intrinsics
+    assert matrix is not None  # a .frame file has them
+    still = CalibratedCamera(pinhole_of_matrix(matrix, clip, folder, _REMEDY), np.eye(3), np.zeros(3))
+    return Calibration(folder, "INSTA tracker", {EVERY_FRAME: still}, metric=True, upright=False)
+
+
+def _views(source: Path, table: Any, path: Path, clip: Clip) -> tuple[dict[str, CalibratedCamera], str]:
+    """Frame number -> camera, and whose axes the file has."""
+    entries = _entries(source, table, path, clip)
+    if not entries:
+        raise UserError(f"{path} names no picture of {clip.path}: {_REMEDY}")
+    matrices = {
+        number: read_array(frame, "transform_matrix", (4, 4), f"{path}, frame {number}", _REMEDY)
+        for number, frame in entries.items()
+    }
+    axes = _axes(np.stack(list(matrices.values())), path)
     views = {}
-    for number, frame in _entries(source, table, path, clip).items():
-        where = f"{path}, frame {number}"
-        matrix = read_array(frame, "transform_matrix", (4, 4), where, _REMEDY)
-        rotation = (matrix[:3, :3] @ _FLIP).T
+    for number, frame in entries.items():
+        where, matrix = f"{path}, frame {number}", matrices[number]
+        rotation = matrix[:3, :3].T if axes == "OpenCV" else (matrix[:3, :3] @ _FLIP).T
         check_rotation(rotation, where)
-        own = {**table, **frame}
-        size = [float(own.get(name, side)) for name, side in (("w", clip.width), ("h", clip.height))]
-        focal = [read_array(own, key, (), where, _REMEDY) for key in ("fl_x", "fl_y")]
-        centre = [
-            numbers(own.get(k, s / 2), (), where, _REMEDY) for k, s in zip(("cx", "cy"), size, strict=True)
-        ]
-        scale = [clip.width / size[0], clip.height / size[1]] if min(size) > 0 else [1.0, 1.0]
-        if min(focal) <= 0:
-            raise UserError(f"{where}: the focal length is not positive: {_REMEDY}")
-        params = [(float(f * s), float(c * s)) for f, c, s in zip(focal, centre, scale, strict=True)]
-        lens = pinhole_lens(
-            clip.width, clip.height, (params[0][0], params[1][0]), (params[0][1], params[1][1])
-        )
+        lens = _lens({**table, **frame}, clip, where)
         views[str(number)] = CalibratedCamera(lens, rotation, -rotation @ matrix[:3, 3])
-    return views
+    return views, axes
+
+
+def _axes(matrices: np.ndarray, path: Path) -> str:
+    """Whose axes cameras-to-world [T, 4, 4] have, by the side on which the head, the origin, lies."""
+    depths = -np.einsum("ti,ti->t", matrices[:, :3, 2], matrices[:, :3, 3])  # along the third axis
+    before, behind = (depths > 0).mean(), (depths < 0).mean()
+    if max(before, behind) < _SAME_SIDE:
+        raise UserError(
+            f"{path}: the head, the origin of its world, lies before {before:.0%} of the cameras and behind "
+            f"{behind:.0%}, so its axes are in doubt: {_REMEDY}"
+        )
+    return "OpenCV" if before > behind else "OpenGL"
+
+
+def _lens(own: Mapping[str, Any], clip: Clip, where: str) -> Any:
+    """The lens of a frame's entry, for pictures of the clip's size."""
+    size = [
+        float(numbers(own.get(name, side), (), where, _REMEDY))
+        for name, side in (("w", clip.width), ("h", clip.height))
+    ]
+    focal = [read_array(own, key, (), where, _REMEDY) for key in ("fl_x", "fl_y")]
+    centre = [
+        numbers(own.get(key, side / 2), (), where, _REMEDY)
+        for key, side in zip(("cx", "cy"), size, strict=True)
+    ]
+    if min(focal) <= 0:
+        raise UserError(f"{where}: the focal length is not positive: {_REMEDY}")
+    scale = [clip.width / size[0], clip.height / size[1]] if min(size) > 0 else [1.0, 1.0]
+    fx, fy = (float(f * s) for f, s in zip(focal, scale, strict=True))
+    cx, cy = (float(c * s) for c, s in zip(centre, scale, strict=True))
+    return pinhole_lens(clip.width, clip.height, (fx, fy), (cx, cy))
 
 
 def _entries(source: Path, table: Any, path: Path, clip: Clip) -> dict[int, dict[str, Any]]:
     """Frame number -> its entry; each picture must lie inside the folder."""
-    frames = entry(table, "frames", path, _REMEDY)
-    if not isinstance(frames, list):
-        raise UserError(f"{path}: 'frames' is no list: {_REMEDY}")
-    named = {str(entry(frame, "file_path", path, _REMEDY)): frame for frame in frames}
+    named = {str(entry(one, "file_path", path, _REMEDY)): one for one in _frames(table, path)}
     for name in named:
         inside(source, name, path)
     match = match_names(named, clip_frames(clip), path)
@@ -129,41 +192,3 @@ def _entries(source: Path, table: Any, path: Path, clip: Clip) -> dict[int, dict
 def _listed(source: Path, part: str, clip: Clip) -> frozenset[int] | None:
     path = source / f"transforms_{part}.json"
     return frozenset(_entries(source, parse_json(path, _REMEDY), path, clip)) if path.is_file() else None
-
-
-def _head(path: Path) -> dict[str, np.ndarray]:
-    """Jaw and eyes as rotation vectors [3, 3], expression, and the head in the camera."""
-    value = read_torch(path, _REMEDY, _FRAME_BYTES)
-    flame, camera = entry(value, "flame", path, _REMEDY), entry(value, "opencv", path, _REMEDY)
-    shapes = (("R", (3, 3)), ("t", (3,)), ("K", (3, 3)))
-    found = {key: read_array(camera, key, shape, path, _REMEDY) for key, shape in shapes}
-    check_rotation(found["R"], str(path))
-    found["exp"] = read_array(flame, "exp", (-1,), path, _REMEDY)
-    turns = [_rotation_vectors(flame, key, count, path) for key, count in (("jaw", 1), ("eyes", 2))]
-    return {**found, "turns": np.concatenate(turns)}
-
-
-def _rotation_vectors(flame: Any, key: str, count: int, path: Path) -> np.ndarray:
-    """[count, 3]; zero where the file says nothing."""
-    if key not in flame:
-        return np.zeros((count, 3))
-    flat = read_array(flame, key, (-1,), path, _REMEDY)
-    if len(flat) == 3 * count:
-        return flat.reshape(count, 3)
-    rows = numbers(flat, (count, 2, 3), f"{path}, {key}", _REMEDY)
-    first = rows[:, 0] / np.maximum(np.linalg.norm(rows[:, 0], axis=1, keepdims=True), 1e-9)
-    second = rows[:, 1] - (rows[:, 1] * first).sum(1, keepdims=True) * first
-    second = second / np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-9)
-    third = np.cross(first, second)
-    return Rotation.from_matrix(np.stack([first, second, third], axis=1)).as_rotvec()
-
-
-def _poses(heads: dict[int, dict[str, np.ndarray]]) -> InitialPoses | None:
-    if not heads:
-        return None
-    rotation = np.zeros((len(heads), 55, 3))
-    rotation[:, 0] = Rotation.from_matrix(np.stack([one["R"] for one in heads.values()])).as_rotvec()
-    rotation[:, 22:25] = np.stack([one["turns"] for one in heads.values()])
-    width = min(len(one["exp"]) for one in heads.values())
-    expression = np.stack([one["exp"][:width] for one in heads.values()])
-    return initial_poses(list(heads), rotation, expression)

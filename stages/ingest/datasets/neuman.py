@@ -27,7 +27,7 @@ from pipeline.clip.frame_files import number_files
 from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration_files import find_model, read_model
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import Recording, Shot, files_of
+from stages.ingest.datasets.recording import Recording, Shot, files_of, lacking
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import PICTURES, clip_frames, folder_clip
 
@@ -57,11 +57,18 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         poses=read_exavatar_poses(source, clip_frames(clip), smoothed=False),
     )
     train, test = _split(source, list(clip.pictures))
-    return Recording("neuman", (shot,), train, test)
+    notes = [lacking("masks", len(masks or ()), len(clip.pictures), "masks/ and segmentations/")]
+    if not _listed(source):
+        notes.append(f"no {' and '.join(_LISTS)}, so the split is NeuMan's rule")
+    return Recording("neuman", (shot,), train, test, tuple(note for note in notes if note))
+
+
+def _listed(source: Path) -> bool:
+    return all((source / name).is_file() for name in _LISTS)
 
 
 def _split(source: Path, frames: list[int]) -> tuple[frozenset[int], frozenset[int]]:
-    if all((source / name).is_file() for name in _LISTS):
+    if _listed(source):
         listed = [read_numbers(source / name, _REMEDY, ".png") for name in _LISTS]
         return frozenset(listed[0]), frozenset(listed[1])
     return official_split(frames)

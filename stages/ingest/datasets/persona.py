@@ -18,12 +18,14 @@ import dataclasses
 from pathlib import Path
 
 from pipeline.clip.frame_files import match_names, number_files
+from pipeline.clip.records import SHOT_STEP
 from pipeline.errors import UserError
 from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.calibration_files import open_calibration
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot, files_of, renumbered
+from stages.ingest.datasets.prepared import prepared_notes
+from stages.ingest.datasets.recording import Recording, Shot, files_of, renumbered
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import PICTURES, clip_frames, folder_clip
 
@@ -41,7 +43,9 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         raise UserError(f"{source} has no captured/: {_REMEDY}")
     shots = [_shot(source / "captured", 0)]
     generated = sorted(path.name for path in source.glob("generated_*"))
-    notes = (f"{', '.join(generated)} are not footage and are left out",) if generated else ()
+    notes = prepared_notes(shots[0])
+    if generated:
+        notes += (f"{', '.join(generated)} are not footage and are left out",)
     if not (source / "test" / "images").is_dir():
         return Recording("persona", tuple(shots), notes=notes)
     shots.append(_shot(source / "test", SHOT_STEP))

@@ -17,10 +17,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from pipeline.clip.records import SHOT_STEP
 from pipeline.config.settings import near
 from pipeline.errors import UserError
 from stages.ingest.cameras.rig import camera_names, read_rig
-from stages.ingest.datasets.recording import SHOT_STEP, Recording, Shot
+from stages.ingest.datasets.recording import Recording, Shot
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import VIDEOS, open_clip
 

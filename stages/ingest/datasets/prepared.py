@@ -26,7 +26,7 @@ from pipeline.untrusted import read_numbers
 from stages.ingest.cameras.calibration import Calibration
 from stages.ingest.cameras.calibration_files import find_model, open_calibration, read_model
 from stages.ingest.datasets.exavatar_poses import read_exavatar_poses
-from stages.ingest.datasets.recording import Recording, Shot, files_of
+from stages.ingest.datasets.recording import Recording, Shot, files_of, lacking
 from stages.ingest.settings import IngestSettings
 from stages.ingest.video import PICTURES, Clip, clip_frames, folder_clip, open_clip
 
@@ -55,13 +55,27 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         masks=_files_of(source / "masks", whole, clip),
         poses=read_exavatar_poses(source, clip_frames(whole), smoothed=True),
     )
+    notes = prepared_notes(shot)
     train, test = lists.get("train"), lists.get("test")
     if train is not None and test is None and source.name.endswith("_gen"):
-        return Recording("prepared", (shot,), train, frozenset())
+        return Recording("prepared", (shot,), train, frozenset(), notes)
     if train is None or test is None or train & test:
         note = "the test list repeats training frames, so the clip's end is held out"
-        return Recording("prepared", (shot,), notes=(note,) if train and test else ())
-    return Recording("prepared", (shot,), train, test)
+        return Recording("prepared", (shot,), notes=(*notes, note) if train and test else notes)
+    return Recording("prepared", (shot,), train, test, notes)
+
+
+def prepared_notes(shot: Shot) -> tuple[str, ...]:
+    """What a prepared clip promises and does not have, a line each."""
+    frames = shot.clip.expected
+    poses = 0 if shot.poses is None else len(shot.poses.frames)
+    notes = (
+        lacking("masks", len(shot.masks or ()), frames, "masks/"),
+        lacking("keypoints", len(shot.keypoints or ()), frames, "keypoints_whole_body/"),
+        lacking("poses", poses, frames, "smplx_optimized/ and smplx_init/"),
+        "" if shot.calibration else "no cameras in sparse/ and cam_params/",
+    )
+    return tuple(note for note in notes if note)
 
 
 def _lists(source: Path) -> dict[str, frozenset[int]]:

@@ -17,9 +17,6 @@ from pipeline.pose_files import InitialPoses
 from stages.ingest.cameras.calibration import Calibration, pinhole_lens
 from stages.ingest.video import PICTURES, Clip, clip_frames
 
-SHOT_STEP = 100_000
-"""Frame numbers of the n-th further shot begin at n times this."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
@@ -63,6 +60,20 @@ class Recording:
 def files_of(folder: Path, clip: Clip, suffixes: Sequence[str] = PICTURES) -> dict[int, Path] | None:
     """The files of a folder that belong to frames of a clip, by frame number; None where there are none."""
     return match_files(folder, suffixes, clip_frames(clip))[0] or None
+
+
+def lacking(what: str, found: int, frames: int, where: str) -> str:
+    """A note on files that a layout promises; empty where every frame has one.
+
+    Args:
+        what: their name in the plural.
+        found: how many there are.
+        frames: of the clip; 0 where it does not say how many it has.
+        where: the folders that were looked into.
+    """
+    if not found:
+        return f"no {what} in {where}"
+    return f"{what} in {where} for {found} of {frames} frames" if found < frames else ""
 
 
 _PER_FRAME = ("rotation", "expression", "transl", "valid", "hand_pca")

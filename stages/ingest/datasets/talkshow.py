@@ -9,11 +9,13 @@ The source is the folder that holds both, or the clip alone; a .pkl elsewhere is
 Source: SHOW and TalkSHOW (github.com/yhw-yhw). The pickle has numbers of each frame t (numpy arrays or
 torch tensors): global_orient [T, 1, 3], body_pose_axis [T, 63], jaw_pose, leye_pose, reye_pose [T, 3],
 left_hand_pose and right_hand_pose [T, 12], expression [T, 100], transl [T, 3], betas [1, 300]; and width,
-height, center, focal_length, camera_transl [3]. Conversions: the camera is SMPLify-X's, whose axes are
-OpenCV's and which does not turn, so a point of the body is at x + camera_transl in it, and trans = transl +
-camera_transl. The hands are 12 coefficients of SMPL-X's hand components, added to the model's mean
-(flat_hand_mean is false): without the user's SMPL-X file (``body=``), whose components they need, they
-begin relaxed, and the fit says so.
+height, center, focal_length, camera_transl [3]. SHOW's program also writes a list that holds this one
+table. There are as many frames as the clip has; a file of another number is another clip's and is refused.
+Conversions: the camera does not turn, but it is PyTorch3D's, whose x and y point the other way than
+OpenCV's, so with t = camera_transl a point x of the body is at x + (-t_x, -t_y, t_z) in OpenCV's axes, and
+trans = transl + (-t_x, -t_y, t_z). The hands are 12 coefficients of SMPL-X's hand components, added to the
+model's mean (flat_hand_mean is false): without the user's SMPL-X file (``body=``), whose components they
+need, they begin relaxed, and the fit says so.
 """
 
 from __future__ import annotations
@@ -30,9 +32,10 @@ from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Cal
 from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array, stacked
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import VIDEOS, open_clip
+from stages.ingest.video import VIDEOS, Clip, open_clip, read_clip
 
 _REMEDY = "take SHOW's .pkl again, or leave it out"
+_TO_OPENCV = np.array([-1.0, -1.0, 1.0])
 _PARTS = (  # key -> numbers a frame, the joint it begins at
     ("global_orient", 3, 0), ("body_pose_axis", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
     ("reye_pose", 3, 24),
@@ -54,16 +57,39 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         video, pickled = videos[0], pickled or (found[0] if found else None)
     clip = open_clip(video)
     if pickled is None:
-        return Recording("talkshow", (Shot(clip),))
-    table = read_pickle(pickled, _REMEDY)
+        note = f"no .pkl of SHOW's beside {video.name}: pose and camera are estimated"
+        return Recording("talkshow", (Shot(clip),), notes=(note,))
+    table = _table(read_pickle(pickled, _REMEDY), pickled)
+    poses = _poses(table, pickled)
+    _check_length(len(poses.frames), clip, pickled)
     calibration = Calibration(
         pickled, "SHOW", {EVERY_FRAME: _view(table, pickled)}, metric=True, upright=False
     )
-    return Recording("talkshow", (Shot(clip, calibration, poses=_poses(table, pickled)),))
+    return Recording("talkshow", (Shot(clip, calibration, poses=poses),))
 
 
 def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+
+
+def _table(value: Any, path: Path) -> Any:
+    """The one table of a pickle."""
+    if not isinstance(value, list | tuple):
+        return value
+    if len(value) != 1:
+        raise UserError(f"{path} is a list of {len(value)} results, not of one: {_REMEDY}")
+    return value[0]
+
+
+def _check_length(count: int, clip: Clip, path: Path) -> None:
+    """Refuse the poses of another clip."""
+    frames = clip.expected
+    if frames != count:  # containers may be wrong about how many frames they have
+        frames = sum(1 for _ in read_clip(clip, damaged="skip"))
+    if frames != count:
+        raise UserError(
+            f"{path} is of {count} frames, {clip.path} has {frames}: take the .pkl of this very clip"
+        )
 
 
 def _view(table: Any, path: Path) -> CalibratedCamera:
@@ -93,6 +119,6 @@ def _poses(table: Any, path: Path) -> InitialPoses:
     camera = read_array(table, "camera_transl", (-1, 3), path, _REMEDY)
     if len(camera) not in (1, count):
         raise UserError(f"{path}, 'camera_transl' is neither of one frame nor of {count}: {_REMEDY}")
-    transl = number("transl", 3) + camera
+    transl = number("transl", 3) + camera * _TO_OPENCV
     expression, betas = number("expression", -1), read_array(table, "betas", (-1,), path, _REMEDY)
     return initial_poses(range(count), rotation, expression, betas, transl, hands=hands)

@@ -6,10 +6,11 @@
     images/<id>.png or .jpg
     masks/<id>.png or .jpg    white is the person
 
-Source: WildAvatar's release (zenodo 11526806) and its prepare_data. The poses are SMPL's and have no
-translation: the body turns about its root joint at the origin of its own axes, and the extrinsics
-(world-to-camera, OpenCV axes, metres) say where the camera is. So each frame has a camera of its own, and
-the world is the person's. Conversion of the 72 numbers: ``smplx_poses``.
+Source: WildAvatar's release (zenodo 11526806) and its toolbox (wildavatar/WildAvatar_Toolbox:
+prepare_data.py, vis_smpl.py, lib/gauhuman/dataset.py). The poses are SMPL's and have no translation: the
+body turns about its root joint at the origin of its own axes, and the extrinsics (world-to-camera, OpenCV
+axes, metres) say where the camera is. So each frame has a camera of its own, and the world is the person's.
+Conversion of the 72 numbers: ``smplx_poses``.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from stages.ingest.datasets.recording import (
     Recording,
     Shot,
     files_of,
+    lacking,
     pinhole_of_matrix,
     read_array,
 )
@@ -56,7 +58,12 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     views = {str(frame): _view(one, clip, f"{path}, frame {frame}") for frame, one in frames.items()}
     calibration = Calibration(path, "WildAvatar", views, metric=True, upright=False, by_frame=True)
     masks = files_of(source / "masks", clip)
-    return Recording("wildavatar", (Shot(clip, calibration, None, masks, "white", _poses(frames)),))
+    shot = Shot(clip, calibration, None, masks, "white", _poses(frames))
+    notes = (
+        lacking("masks", len(masks or ()), len(clip.pictures), "masks/"),
+        lacking("poses", len(frames), len(clip.pictures), path.name),
+    )
+    return Recording("wildavatar", (shot,), notes=tuple(note for note in notes if note))
 
 
 def _frames(table: Any, path: Path) -> dict[int, dict[str, np.ndarray]]:

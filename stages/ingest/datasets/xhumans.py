@@ -2,17 +2,24 @@
 
 ::
 
-    <id>/train/<Take>/render/image/*_000012.png
-    <id>/train/<Take>/render/cameras.npz          intrinsic [3, 3], extrinsic [T, 3, 4] or one of [3|4, 4]
-    <id>/train/<Take>/render/keypoints_whole_body/12.json
-    <id>/train/<Take>/SMPLX/*000012*.pkl
+    <id>/mean_shape_smplx.npy                     betas [10] of all takes
+    <id>/train/<Take>/render/image/color_000012.png
+    <id>/train/<Take>/render/cameras.npz          intrinsic [3, 3], extrinsic [T, 4, 4] (or [3|4, 4] alone)
+    <id>/train/<Take>/render/keypoints_whole_body/12.json    where ExAvatar prepared it
+    <id>/train/<Take>/render/mask/mask_000012.png            where rendered again: labels in colours
+    <id>/train/<Take>/SMPLX/mesh-f00012_smplx.pkl
 
-The source is the take's folder. Source: ExAvatar's reader, which names the files; ExAvatar's takes are 00028
-Take15, 00034 Take14, 00087 Take8. What is in the pickles it does not say; the names of the smplx package
-are read (global_orient, body_pose, jaw_pose, leye_pose, reye_pose, left_hand_pose, right_hand_pose,
-expression, betas, transl), and a file without them is refused. Conversions: extrinsics are world-to-camera
-with OpenCV axes, in metres; transl is relative to the root joint in the world. Hands of fewer than 45
-numbers are coefficients of SMPL-X's components, relative to the mean (see ``talkshow``).
+The source is the take's folder. Source: X-Avatar (Skype-line/X-Avatar: data_process/README.md and
+rendering_RGBD_image.py, which writes pictures and cameras, lib/dataset/XHumans_rgbd.py); ExAvatar's takes
+are 00028 Take15, 00034 Take14, 00087 Take8. The pickles have the smplx package's names (global_orient,
+body_pose, jaw_pose, leye_pose, reye_pose, left_hand_pose, right_hand_pose, expression, betas, transl);
+their betas are to be replaced by mean_shape_smplx.npy. Pictures are counted from 1 in the order of the
+meshes, whose own numbers may begin elsewhere: where there are as many, the n-th pickle and the n-th camera
+are the n-th picture's.
+
+Conversions: extrinsics are world-to-camera with OpenCV axes, in metres; transl is relative to the root
+joint in the world. Hands are rotations relative to the mean hand (flat_hand_mean is false); of fewer than
+45 numbers they are coefficients of SMPL-X's components (see ``talkshow``).
 """
 
 from __future__ import annotations
@@ -23,10 +30,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.clip.frame_files import number_files
+from pipeline.clip.frame_files import number_files, visible_files
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
-from pipeline.untrusted import read_npz, read_pickle
+from pipeline.untrusted import read_npy, read_npz, read_pickle
 from stages.ingest.cameras.calibration import CalibratedCamera, Calibration, check_rotation
 from stages.ingest.cameras.extrinsics import Extrinsics
 from stages.ingest.datasets.recording import (
@@ -34,6 +41,7 @@ from stages.ingest.datasets.recording import (
     Shot,
     entry,
     files_of,
+    lacking,
     numbers,
     pinhole_of_matrix,
     read_array,
@@ -41,8 +49,9 @@ from stages.ingest.datasets.recording import (
 )
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import PICTURES, folder_clip
+from stages.ingest.video import PICTURES, Clip, folder_clip
 
+MEAN_SHAPE = "mean_shape_smplx.npy"
 _REMEDY = "unpack the X-Humans take again"
 _BODY = (("global_orient", 3, 0), ("body_pose", 63, 1), ("jaw_pose", 3, 22), ("leye_pose", 3, 23),
          ("reye_pose", 3, 24))  # fmt: skip
@@ -62,14 +71,33 @@ def read(source: Path, settings: IngestSettings) -> Recording:
     cameras = _cameras(table, path, list(clip.pictures))
     lens = pinhole_of_matrix(read_array(table, "intrinsic", (3, 3), path, _REMEDY), clip, path, _REMEDY)
     views = {str(frame): CalibratedCamera(lens, *pose) for frame, pose in cameras.items()}
+    pickles = _pickles(source / "SMPLX", clip)
+    shape = _mean_shape(source)
     shot = Shot(
         clip=clip,
         calibration=Calibration(path, "X-Humans", views, metric=True, upright=False, by_frame=True),
         keypoints=files_of(render / "keypoints_whole_body", clip, (".json",)),
         masks=files_of(render / "mask", clip),
-        poses=_poses(files_of(source / "SMPLX", clip, (".pkl",)) or {}, cameras),
+        poses=_poses(pickles, cameras, shape),
     )
-    return Recording("xhumans", (shot,))
+    notes = [lacking("poses", len(pickles), len(clip.pictures), "SMPLX/")]
+    if pickles and shape is None:
+        notes.append(f"no {MEAN_SHAPE} two folders up, so the shape is the pickles' own")
+    return Recording("xhumans", (shot,), notes=tuple(note for note in notes if note))
+
+
+def _pickles(folder: Path, clip: Clip) -> dict[int, Path]:
+    """Frame -> pickle: by their order where there are as many as pictures, else by their numbers."""
+    files = visible_files(folder, (".pkl",))
+    if len(files) == len(clip.pictures):
+        return dict(zip(clip.pictures, files, strict=True))
+    return files_of(folder, clip, (".pkl",)) or {}
+
+
+def _mean_shape(source: Path) -> np.ndarray | None:
+    """The person's betas, which all takes share; None where the take is not in its person's folder."""
+    path = source.resolve().parent.parent / MEAN_SHAPE
+    return numbers(read_npy(path, _REMEDY), (-1,), str(path), _REMEDY) if path.is_file() else None
 
 
 def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, Extrinsics]:
@@ -89,7 +117,9 @@ def _cameras(table: dict[str, Any], path: Path, frames: list[int]) -> dict[int, 
     return found
 
 
-def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPoses | None:
+def _poses(
+    files: dict[int, Path], cameras: dict[int, Extrinsics], shape: np.ndarray | None
+) -> InitialPoses | None:
     known = {frame: file for frame, file in files.items() if frame in cameras}
     if not known:
         return None
@@ -115,7 +145,7 @@ def _poses(files: dict[int, Path], cameras: dict[int, Extrinsics]) -> InitialPos
     joined = {name: stacked(arrays, folder, _REMEDY) for name, arrays in columns.items()}
     transl = joined["transl"]
     place = _place(transl[:, 0], transl[:, 1], np.stack([cameras[frame][0] for frame in known]))
-    betas = np.median(joined["betas"], axis=0)
+    betas = np.median(joined["betas"], axis=0) if shape is None else shape
     root = np.array(ROOT)
     return initial_poses(list(known), rotation, joined["expression"], betas, place, root, joined["hands"])
 
