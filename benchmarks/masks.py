@@ -30,12 +30,12 @@ from benchmarks.fit_truth import Stage, load_stage
 from pipeline.body import pose_body, rasterize
 from pipeline.body.joints import joint_index
 from pipeline.body.parts import PARTS, part_labels
+from pipeline.clip.background import log_odds
 from pipeline.clip.keypoints import BODY
 from pipeline.config.workspace import open_workspace
 from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
 from pipeline.detection.u2net import SaliencyModel
 from pipeline.detection.wholebody import to_keypoints, to_pixels
-from stages.ingest.background import log_odds
 from stages.ingest.mannequin import MannequinSpec
 from stages.ingest.mannequin.footage import Filming
 from stages.ingest.mannequin.scene import film
@@ -91,7 +91,8 @@ def measure(options: argparse.Namespace, report: frame.Report) -> str:
     before, after = rows["fused"], rows["parts"]
     return (
         f"hands {before['hands']:.3f} to {after['hands']:.3f}, "
-        f"feet {before['feet']:.3f} to {after['feet']:.3f}, IoU {before['iou']:.4f} to {after['iou']:.4f} for {after['ms'] - before['ms']:.0f} ms a picture"
+        f"feet {before['feet']:.3f} to {after['feet']:.3f}, IoU {before['iou']:.4f} to "
+        f"{after['iou']:.4f} for {after['ms'] - before['ms']:.0f} ms a picture"
     )
 
 

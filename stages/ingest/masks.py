@@ -4,8 +4,8 @@ The pose model's segmentation knows which body is meant and has limbs and feet, 
 selfie segmentation is sharp about heads and shoulders, but takes in furniture and other people. How
 far the two agree over the clip says how far the second can be trusted. What is known of a background
 that stands still is then taken out, the edge is moved to the picture's edges, hands and feet that the
-detector saw are completed (``mask_parts.py``), and the masks are averaged along the motion: an avatar
-cannot score higher than the masks agree with one another.
+detector saw are completed where that is asked for (``mask_parts.py``), and the masks are averaged along
+the motion: an avatar cannot score higher than the masks agree with one another.
 """
 
 from __future__ import annotations
