@@ -320,10 +320,10 @@ def task_prune():
 
 def view_subject() -> TaskFailed | None:
     """Shows the chosen subject's avatar until it is told to stop."""
-    from pipeline.viewer.view import view
-
     if len(CHOSEN) > 1:
         return TaskFailed("view shows one subject: name one, subject=NAME")
+    from pipeline.viewer.view import view
+
     try:
         view(CHOSEN[0], REQUEST)
     except (UserError, OSError) as error:

@@ -44,8 +44,8 @@ from stages.ingest.mannequin.footage import Mannequin, make_mannequin
 
 MOTIONS = {"head": "nod+speech+eyes", "upper": "sway+gesture+eyes"}
 SIZES = {"head": 256, "upper": 384}
-IDENTITIES = (1, 2, 3)
-FRAMES, QUICK_FRAMES = 75, 12
+IDENTITIES = (1, 2)
+FRAMES, QUICK_FRAMES = 50, 12
 VARIANTS: dict[str, dict[str, Any]] = {
     "own terms": {},
     "as other points": {"lambda_lids": 0.0, "lambda_gaze": 0.0},

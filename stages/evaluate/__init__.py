@@ -44,5 +44,5 @@ STAGE = Stage(
     assets=lambda settings: settings.assets,
     reads_body=True,
     path_settings=("second_mask", "arcface"),
-    path_words=("", "off", "edge", "estimator"),
+    path_words=("", "off", "edge", "estimator", "independent"),
 )

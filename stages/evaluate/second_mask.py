@@ -3,6 +3,7 @@
 An avatar is scored under one mask and cannot know it at its edges; two good masks of one frame differ
 there. What the truth itself scores when a second mask cuts it out is what a perfect avatar could expect.
 
+- ``independent``: U2-Net's, which had no part in the clip's masks, in the box of the person.
 - ``edge``: the same mask, one pixel smaller: what a pixel of the outline is worth. Needs nothing, and knows
   nothing of where masks go wrong.
 - ``estimator``: MediaPipe's own, frame by frame. It has two segmentations, of its pose model and of its
@@ -26,6 +27,7 @@ from pipeline.clip.composite import composite_frame
 from pipeline.clip.frame_files import frame_files
 from pipeline.clip.frames import spread_end_to_end
 from pipeline.detection.mediapipe import Estimator, estimator_scale, resize
+from pipeline.detection.u2net import SaliencyModel
 from pipeline.errors import UserError
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.methods import CEILING, OnBackground
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 SHORT_SIDE, LONG_SIDE = 400, 1920  # pixels that the estimator is shown, as by ingest's defaults
+MARGIN = 0.12  # of the person's extent, around it: what the independent model is shown
 _SEGMENTATIONS = ("body_mask", "selfie_mask")
 _NAMES = {"body_mask": "its pose model's segmentation", "selfie_mask": "its selfie segmentation"}
 
@@ -89,6 +92,10 @@ def second_mask(context: Context, clip: EvaluatedClip) -> SecondMask:
         estimator = Estimator(context.assets["mediapipe"], context.work / "mediapipe.log", still=True)
         with context.progress(len(frames), "second masks") as progress:
             return estimated(estimator, clip, frames, progress.advance)
+    if settings.second_mask == "independent":
+        model = SaliencyModel(context.assets["u2netp"])
+        with context.progress(len(frames), "second masks") as progress:
+            return independent(model, clip, frames, progress.advance)
     folder = Path(settings.second_mask)
     files = frame_files(folder, PICTURES, clip.footage.all_frames, log=context.log)
     masks = {frame: read_given(folder, files.get(frame), clip, frame) for frame in frames}
@@ -118,6 +125,45 @@ def estimated(
     if not found[best]:
         return no_second_mask(clip)
     return SecondMask(clip, found[best], f"MediaPipe's, {_NAMES[best]}, overlap {agreement[best]:.3f}")
+
+
+def independent(
+    model: Callable[[np.ndarray], np.ndarray],
+    clip: EvaluatedClip,
+    frames: Sequence[int],
+    advance: Callable[[], object],
+) -> SecondMask:
+    """A model's masks of some frames, in the box of the clip's mask; a frame without a person has none.
+
+    Args:
+        model: from a picture [H, W, 3] uint8 to a mask [H, W] in [0, 1].
+        clip, frames: what is masked.
+        advance: called after every frame.
+    """
+    masks = {}
+    for frame in frames:
+        mask = clip.mask(frame)
+        box = person_box(mask > 127, MARGIN)
+        if box is not None:
+            alpha = np.zeros(mask.shape, np.float32)
+            alpha[box] = model(np.ascontiguousarray(clip.frame(frame)[box]))
+            masks[frame] = np.round(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
+        advance()
+    if not masks:
+        return no_second_mask(clip)
+    return SecondMask(clip, masks, f"U2-Net's, overlap {mean_overlap(clip, masks):.3f}")
+
+
+def person_box(inside: np.ndarray, margin: float) -> tuple[slice, slice] | None:
+    """Rows and columns of the True pixels [H, W] and a margin, a share of their extent; None without any."""
+    box = []
+    for axis, length in ((1, inside.shape[0]), (0, inside.shape[1])):
+        places = np.flatnonzero(inside.any(axis))
+        if not len(places):
+            return None
+        more = round(margin * (places[-1] + 1 - places[0]))
+        box.append(slice(max(0, int(places[0]) - more), min(length, int(places[-1]) + 1 + more)))
+    return box[0], box[1]
 
 
 def mean_overlap(clip: EvaluatedClip, masks: Mapping[int, np.ndarray]) -> float:

@@ -79,10 +79,10 @@ class EvaluateSettings:
     mesh_frames: CountOrNone = setting(
         12, "training frames that give the textured mesh, a baseline, its colours; 0: without it"
     )
-    # estimator is MediaPipe's own, frame by frame, and needs its asset.
+    # independent is U2-Net's and estimator MediaPipe's own, frame by frame; each needs its asset.
     second_mask: NotEmpty = setting(
-        "estimator",
-        "what the ceiling is measured with: edge (the mask, a pixel smaller), estimator, off, "
+        "independent",
+        "what the ceiling is measured with: independent, edge (the mask, a pixel smaller), estimator, off, "
         "or a folder of grey pictures named by frame number",
     )
     second_mask_frames: CountOrNone = setting(12, "held-out frames that it is measured on; 0: all")
@@ -124,5 +124,5 @@ class EvaluateSettings:
     @property
     def assets(self) -> tuple[str, ...]:
         """The assets that these settings call for."""
-        estimator = ("mediapipe",) if self.second_mask == "estimator" else ()
-        return ("lpips", *estimator, *(("dlib", "identity") if self.identity else ()))
+        witness = {"estimator": ("mediapipe",), "independent": ("u2netp",)}.get(self.second_mask, ())
+        return ("lpips", *witness, *(("dlib", "identity") if self.identity else ()))

@@ -18,7 +18,7 @@ def idle(settings: IngestSettings) -> dict[str, str]:
     found = dict.fromkeys(filming[1:], "it is filmed: ingest.mannequin=full, upper or head makes footage up")
     if settings.masks not in ("auto", "mediapipe"):
         remedy = "masks that are given are used as they are: leave out ingest.masks, or this"
-        found.update(dict.fromkeys(("mask_edge", "mask_steadiness", "background"), remedy))
+        found.update(dict.fromkeys(("mask_edge", "mask_parts", "mask_steadiness", "background"), remedy))
     if settings.test_frames:
         found["test_fraction"] = "ingest.test_frames says how many: leave out one of the two"
     if settings.cameras in ("pinhole", "sfm"):

@@ -3,8 +3,9 @@
 The pose model's segmentation knows which body is meant and has limbs and feet, but is blurred; the
 selfie segmentation is sharp about heads and shoulders, but takes in furniture and other people. How
 far the two agree over the clip says how far the second can be trusted. What is known of a background
-that stands still is then taken out, the edge is moved to the picture's edges, and the masks are
-averaged along the motion: an avatar cannot score higher than the masks agree with one another.
+that stands still is then taken out, the edge is moved to the picture's edges, hands and feet that the
+detector saw are completed where that is asked for (``mask_parts.py``), and the masks are averaged along
+the motion: an avatar cannot score higher than the masks agree with one another.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pipeline.clip.background import learn_background, log_odds, subtract_backgr
 from pipeline.clip.frames import read_frame, read_mask, write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints
 from stages.ingest.mask_edges import follow_edges
+from stages.ingest.mask_parts import complete_parts
 from stages.ingest.mask_smoothing import smooth_masks
 
 if TYPE_CHECKING:
@@ -70,7 +72,10 @@ def refine_masks(context: Context, keypoints: Keypoints, raw: Path) -> None:
             points = keypoints.whole_body[row, BODY]
             seeds = points[points[:, 2] >= SEED_SCORE, :2]
             alpha = fill_holes(main_component(alpha, seeds))
-            yield image, follow_edges(alpha, image, settings.mask_edge)
+            alpha = follow_edges(alpha, image, settings.mask_edge)
+            if settings.mask_parts:
+                alpha = complete_parts(alpha, image, keypoints.whole_body[row])
+            yield image, alpha
 
     with context.progress(len(frames), "masks") as progress:
         for frame, alpha in zip(frames, smooth_masks(cut(), settings.mask_steadiness), strict=True):

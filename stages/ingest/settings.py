@@ -87,6 +87,9 @@ class IngestSettings:
     )
     mask_area: Fraction = setting(0.002, "a frame whose mask covers less of the picture holds no person")
     mask_edge: Fraction = setting(1.0, "how far the mask follows the picture's own edges")
+    mask_parts: bool = setting(
+        False, "complete hands and feet that the detector saw and the mask lost, by their colours"
+    )
     mask_steadiness: Steadiness = setting(
         2, "frames on either side that a mask is averaged with along the motion"
     )

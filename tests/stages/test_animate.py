@@ -76,8 +76,12 @@ def encode_srgb(linear):
 def test_only_what_is_asked_for_is_written(studio, walk):
     plain = studio.animate("plain", motion=str(walk))
     assert names(plain.output) == [
-        "animate.json", "animation.mp4", "cameras.parquet", "frames.png", "motion.parquet",
-    ]  # fmt: skip
+        "animate.json",
+        "animation.mp4",
+        "cameras.parquet",
+        "frames.png",
+        "motion.parquet",
+    ]
     assert set(plain.timings["milliseconds_a_frame"]) == {"pose", "render"}
     frames, rate = video(plain.output / "animation.mp4")
     assert frames.shape == (COUNT, 64, 48, 3) and rate == pytest.approx(FPS)

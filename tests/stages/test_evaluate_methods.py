@@ -17,7 +17,7 @@ from pipeline.metrics.face_identity import RecognizedFace
 from stages.evaluate import statistics
 from stages.evaluate.report.tables import camera_table
 from stages.evaluate.scores import TableRow, score_table
-from stages.evaluate.second_mask import SecondMask, edge, estimated, second_mask
+from stages.evaluate.second_mask import SecondMask, edge, estimated, independent, person_box, second_mask
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.statistics import bounds, differences, intervals
 from stages.evaluate.textured_mesh import nearest_known
@@ -107,6 +107,29 @@ def test_of_the_estimators_two_segmentations_the_agreeing_one_is_taken(clip):
     assert set(found.masks) == set(TEST[:2]) and len(counted) == 3
     assert "selfie" in found.source and found.masks[TEST[0]].shape == (HEIGHT, WIDTH)
     assert not second_mask(clip.context(second_mask="off"), evaluated).masks
+
+
+def test_an_independent_model_sees_the_persons_box_alone(clip):
+    evaluated, shown = clip.clip(), []
+
+    def model(image):
+        shown.append(image)
+        return np.full(image.shape[:2], 0.5, np.float32)
+
+    counted = []
+    found = independent(model, evaluated, TEST, lambda: counted.append(1))
+    assert set(found.masks) == set(TEST) and len(counted) == len(TEST) and "U2-Net" in found.source
+    for frame, image in zip(TEST, shown, strict=True):
+        mask = found.masks[frame]
+        assert (mask[evaluated.mask(frame) > 127] == 128).all()
+        assert (mask > 0).sum() == image.shape[0] * image.shape[1] < mask.size
+
+
+def test_the_box_of_a_person_has_a_margin_and_ends_at_the_picture():
+    inside = np.zeros((20, 30), bool)
+    assert person_box(inside, 0.1) is None
+    inside[2:12, 0:20] = True
+    assert person_box(inside, 0.1) == (slice(1, 13), slice(0, 22))
 
 
 # Protocols
