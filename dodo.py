@@ -10,6 +10,7 @@
     doit run compare dataset=insta              the paper's table, with what was measured here
     doit run batch dataset=insta cluster=auto   the same on a Ray cluster
     doit run animate subject=oliver motion=dance.bvh    the avatar in a motion that nobody filmed
+    doit run animate subject=oliver motion=clip.mp4     in what somebody does in another clip
     doit run view subject=smile                 the avatar in a browser, also while it trains
     doit run ablate subject=smile               what each part of the method is worth
     doit run tradeoff subject=smile budget=20m  what accuracy costs in time
@@ -38,7 +39,15 @@ from pipeline.errors import UserError
 from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
 from pipeline.run.effect import VIEW, check_effect, named_tasks, running
-from pipeline.run.job import Job, check_settings, open_job, shown, wanted_keys
+from pipeline.run.job import (
+    Job,
+    check_footage,
+    check_settings,
+    lent_request,
+    open_job,
+    shown,
+    wanted_keys,
+)
 from pipeline.run.stage import load_stages, usual
 from pipeline.run.stage_runner import StageRunner
 from pipeline.store.artifact import Store
@@ -106,11 +115,35 @@ def kept_subjects(request: Request) -> set[str]:
     return set(stored_subjects(request)) if cares else set()
 
 
+def borrowed_clips(request: Request, chosen: tuple[str, ...]) -> dict[str, Request]:
+    """The clips that are subjects only because a stage reads them: name -> the request that makes it.
+
+    ``motion=clip.mp4`` is one: its ingest and fit are made first, under the clip's name.
+    """
+    found = {}
+    for kind, named in tasks_named():
+        stage = load_stages(request.workspace.stages).get(kind)
+        for subject in ([named] if named else chosen) if stage and stage.on_request else ():
+            try:
+                job = open_job(subject, request)
+                loans = stage.demands(job.settings[kind]).loans
+            except UserError:
+                continue  # the stage itself reports it
+            try:
+                for loan in loans:
+                    check_footage(loan, request)
+            except UserError as error:
+                raise InvalidDodoFile(str(error)) from None
+            found |= {loan.subject: lent_request(loan, request) for loan in loans if loan.source}
+    return {subject: its for subject, its in found.items() if subject not in chosen}
+
+
 REQUEST, CHOSEN = read_command_line()
+BORROWED = borrowed_clips(REQUEST, CHOSEN)
 WORKSPACE = REQUEST.workspace
 STAGES = load_stages(WORKSPACE.stages)
-RUNNER = StageRunner(REQUEST)
-MADE = {*known_subjects(WORKSPACE), *CHOSEN}  # what others are lent of these is made first
+RUNNER = StageRunner(REQUEST, BORROWED)
+MADE = {*known_subjects(WORKSPACE), *CHOSEN, *BORROWED}  # what others are lent of these is made first
 SUBJECTS = tuple(sorted({*MADE, *stored_subjects(REQUEST)}))
 ON_REQUEST = [name for name, stage in STAGES.items() if stage.on_request]
 # "doit clean" deletes what the default tasks made: all of it, also what is only made when asked for.
@@ -132,7 +165,7 @@ DOIT_CONFIG = {
 @functools.cache
 def job_of(subject: str) -> Job:
     """The job of a subject, read when its first task is looked at."""
-    return open_job(subject, REQUEST)
+    return open_job(subject, BORROWED.get(subject, REQUEST))
 
 
 def is_current(stage: str, subject: str) -> bool:
@@ -159,7 +192,7 @@ def run_stage(stage: str, subject: str) -> TaskFailed | None:
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it
         asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
         compile_once(kernels_ahead(job_of(subject), asked, stage))
-        if len(CHOSEN) == 1 and stage in asked[:-1]:
+        if len(CHOSEN) == 1 and stage in asked[:-1] and subject in CHOSEN:
             following = asked[asked.index(stage) + 1]
     reason = RUNNER.run(stage, subject, following)
     return TaskFailed(reason) if reason else None
@@ -197,9 +230,9 @@ def stage_task(stage: str, subject: str) -> dict:
         "name": subject,
         "doc": f"{stage} of {subject}",
         "task_dep": [
+            *needed_of_others(stage, subject),
             *(f"{upstream}:{subject}" for upstream in STAGES[stage].needs),
             *(f"assets:{name}" for name in needed_assets(stage, subject)),
-            *needed_of_others(stage, subject),
         ],
         "uptodate": [functools.partial(is_current, stage, subject)],
         "actions": [(run_stage, [stage, subject])],
@@ -287,10 +320,10 @@ def task_prune():
 
 def view_subject() -> TaskFailed | None:
     """Shows the chosen subject's avatar until it is told to stop."""
-    from pipeline.viewer.view import view
-
     if len(CHOSEN) > 1:
         return TaskFailed("view shows one subject: name one, subject=NAME")
+    from pipeline.viewer.view import view
+
     try:
         view(CHOSEN[0], REQUEST)
     except (UserError, OSError) as error:

@@ -19,6 +19,7 @@ setup(
     package_data={
         INNER: [
             *(f"data/{folder}/*.toml" for folder in ("presets", "subjects", "datasets")),
+            *(f"data/avatars/*{end}" for end in (".md", "/*.safetensors", "/*.parquet")),
             *("data/assets.toml", "data/body/*.npz", "data/body/*.md"),
         ],
         f"{INNER}.pipeline.viewer.page": ["*.jinja", "*.js"],

@@ -46,7 +46,7 @@ class LinearAvatar:
         signal: pose and expression to B numbers.
         joints: [55, 3], at rest.
         parents: of the joints, -1 for the root.
-        opacity: of every Gaussian.
+        opacities: [N].
         trust: [N] in [0, 1], how far frames showed each one's colour.
         parts: [N] int64, an index into ``pipeline.body.PARTS``.
     """
@@ -64,7 +64,7 @@ class LinearAvatar:
     signal: DrivingSignal
     joints: Tensor
     parents: tuple[int, ...]
-    opacity: float
+    opacities: Tensor
     trust: Tensor
     parts: Tensor
 
@@ -111,7 +111,7 @@ def linear_avatar(avatar: Avatar, poses: Sequence[Pose] = ()) -> LinearAvatar:
         signal=signal,
         joints=constants.joints,
         parents=baked.parents,
-        opacity=baked.opacity,
+        opacities=baked.opacities,
         trust=surface.pick(avatar.trust)[:, 0],
         parts=surface.canonical.parts,
     )

@@ -32,6 +32,7 @@ class Expressions:
     Attributes:
         names: the M names.
         coefficients: [M, E], psi of each expression at weight 1, its full range.
+        named: False where the body's file has no names, and these are numbers.
 
     >>> pair = Expressions(("smile", "frown"), torch.tensor([[3.0, 0.0], [0.0, 3.0]]))
     >>> pair.psi({"frown": 0.5})
@@ -40,6 +41,7 @@ class Expressions:
 
     names: tuple[str, ...]
     coefficients: Tensor  # [M, E]
+    named: bool = True
 
     def psi(self, weights: Mapping[str, float]) -> Tensor:
         """The coefficients of some expressions together: name -> weight, 1 for its full range; [E].
@@ -75,7 +77,8 @@ def read_expressions(body_file: Path, count: int) -> Expressions:
         ) from None
     usable = isinstance(names, list) and len(names) == count == len(set(map(str, names)))
     if not usable or not all(isinstance(name, str) for name in names):
-        return Expressions(tuple(f"expression_{place:02d}" for place in range(count)), torch.eye(count))
+        numbered = tuple(f"expression_{place:02d}" for place in range(count))
+        return Expressions(numbered, torch.eye(count), named=False)
     return _with_sides(names)
 
 

@@ -46,5 +46,8 @@ ProtocolName = Literal["ours", "paper", "paper_black"]
 PlyUp = Literal["-y", "y", "z"]
 """The axis that points up in the world of a .ply for other programs; ours is y."""
 
+VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
+"""Suffixes of files that are looked for as clips."""
+
 SplatFormat = Literal["ply", "spz", "glb"]
 """Formats of splats; see ``pipeline.splat.splat_files``."""

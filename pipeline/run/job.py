@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.config import assets as third_party
 from pipeline.config.request import Request
 from pipeline.config.settings import Layer, as_dict, command_line_layer, near, read_toml, resolve
-from pipeline.config.subjects import Subject, load_subject, require_footage
+from pipeline.config.subjects import Subject, known_subjects, load_subject, require_footage
 from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
 from pipeline.run.stage import Context, Loan, Stage, load_stages, upstream_first
@@ -89,7 +89,7 @@ class Job:
         demands = stage.demands(self.settings[name])
         pins = third_party.load_assets(self.workspace) if demands.assets else {}
         lent = {loan: self.lent(name, loan).digest_of(loan.files) for loan in demands.loans}
-        loans = {"loans": [{**dataclasses.asdict(loan), "sha256": digest} for loan, digest in lent.items()]}
+        loans = {"loans": [{**loan.described(), "sha256": digest} for loan, digest in lent.items()]}
         return {
             "stage": name,
             "version": stage.version,
@@ -108,19 +108,22 @@ class Job:
         Raises:
             UserError: there is none.
         """
+        check_footage(loan, self.request)
         own = loan.subject == self.subject.name
         artifact, reason = None, ""
         try:
-            artifact = (self if own else open_job(loan.subject, self.request)).find(loan.stage)
+            lender = self if own else open_job(loan.subject, lent_request(loan, self.request))
+            artifact = lender.find(loan.stage)
         except (
             UserError
         ) as error:  # no such subject, or its footage is not there any more; its results may be
             reason = f" ({error})"
         artifact = artifact or self.store.latest(loan.subject, loan.stage)
         if artifact is None:
+            footage = "" if loan.source is None else f" subject={loan.subject} source={loan.source}"
             raise UserError(
                 f"{name} of '{self.subject.name}' needs {loan.stage} of '{loan.subject}': "
-                f"doit run {loan.stage}:{loan.subject}{reason}"
+                f"doit run {loan.stage}:{loan.subject}{footage}{reason}"
             )
         return artifact
 
@@ -159,6 +162,36 @@ class Job:
         demands = self.stages[name].demands(self.settings[name])
         footage = [self.subject.asset] if demands.source and self.subject.asset else []
         return [*demands.assets, *footage]
+
+
+def lent_request(loan: Loan, request: Request) -> Request:
+    """The request that makes what is lent: of a clip it is about a subject of that footage."""
+    if loan.source is None:
+        return request
+    return dataclasses.replace(request, subjects=(loan.subject,), datasets=(), source=loan.source)
+
+
+def check_footage(loan: Loan, request: Request) -> None:
+    """Refuses a clip whose name is that of a subject with other footage.
+
+    Raises:
+        UserError: says which, and what to do.
+    """
+    if loan.source is None:
+        return
+    name, workspace = loan.subject, request.workspace
+    remedy = f"rename the clip, or write subject:{name} for that subject's motion"
+    known = load_subject(workspace, name).source if name in known_subjects(workspace) else None
+    if name in known_subjects(workspace) and not (known and known.exists() and known.samefile(loan.source)):
+        raise UserError(f"{loan.source}: there is a subject '{name}' with other footage: {remedy}")
+    artifact = Store(workspace.artifacts).latest(name, loan.stage)
+    made = artifact.manifest.get("source") if artifact else None
+    if made and loan.source.exists():
+        if made != digest.of_source(loan.source, workspace.artifacts / ".digests.json"):
+            raise UserError(
+                f"{loan.source}: the store's '{name}' was made from other footage: {remedy}, or delete it: "
+                f"doit clean subject={name}"
+            )
 
 
 def key_of(description: Mapping[str, Any]) -> str:

@@ -26,11 +26,18 @@ class Loan:
         subject: whose.
         stage: whose result they are part of.
         files: patterns of their names; their digests enter the key.
+        source: the subject's footage, where the subject is nothing but a clip that is named; None for one
+            that is there anyway.
     """
 
     subject: str
     stage: str
     files: tuple[str, ...]
+    source: Path | None = None
+
+    def described(self) -> dict[str, Any]:
+        """What of it enters a key: not where the footage lies."""
+        return {"subject": self.subject, "stage": self.stage, "files": self.files}
 
 
 @dataclasses.dataclass(frozen=True)

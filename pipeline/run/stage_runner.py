@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import os
+from collections.abc import Mapping
 
 from pipeline.config.request import Request
 from pipeline.run.process import StageProcess
@@ -18,11 +19,12 @@ class StageRunner:
 
     Attributes:
         request: the command line's.
+        borrowed: subject -> its own request, of those that are a clip which another's stage reads.
     """
 
-    def __init__(self, request: Request):
+    def __init__(self, request: Request, borrowed: Mapping[str, Request] | None = None):
         """Starts nothing yet. What waits in the end is ended with this process."""
-        self.request = request
+        self.request, self.borrowed = request, borrowed or {}
         self._waiting: dict[tuple[str, str], StageProcess] = {}
         atexit.register(self.close)
 
@@ -36,7 +38,7 @@ class StageRunner:
         """
         process = self._waiting.pop((stage, subject), None)
         if process is None:
-            process = StageProcess(stage, subject, self.request)
+            process = StageProcess(stage, subject, self.borrowed.get(subject, self.request))
         if following is not None and (os.cpu_count() or 1) > 1:
             key = (following, subject)
             self._waiting[key] = self._waiting.get(key) or StageProcess(*key, self.request, waits=True)

@@ -135,7 +135,6 @@ def pack(
         "joint_names": list(JOINT_NAMES),
         "part_names": list(PARTS),
         "parents": list(avatar.parents),
-        "opacity": avatar.opacity,
         "motions": [
             {"name": one.name, "fps": one.fps, "frames": len(one), "numbers": list(one.numbers),
              "filmed": bool(one.cameras), "size": [one.cameras[0].width, one.cameras[0].height]
@@ -172,6 +171,7 @@ def _add_avatar(arrays: _Arrays, avatar: LinearAvatar) -> None:
     arrays.floats("signal_limits", avatar.signal.limits.numpy())
     arrays.floats("joints", avatar.joints.numpy())
     arrays.ranged("trust", avatar.trust[:, None].numpy(), 8)
+    arrays.ranged("opacities", avatar.opacities[:, None].numpy(), 16)
     arrays.bytes_("parts", avatar.parts.numpy())
 
 

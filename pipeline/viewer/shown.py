@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import torch
 from pipeline.avatar import Avatar
 from pipeline.avatar.linear_avatar import LinearAvatar, linear_avatar
 from pipeline.body import Poses
+from pipeline.body.expressions import read_expressions
 from pipeline.clip.camera import Camera
 from pipeline.motion.novel_motion import motion_poses
 from pipeline.orbit_cameras import relaxed_pose
@@ -21,8 +21,6 @@ from pipeline.viewer.packed import ViewedMotion, pack
 ARM_ANGLE = 1.0  # radians below the T pose, where nothing else is said
 NOVEL_FRAMES, NOVEL_FPS = 96, 30.0
 MOST_FRAMES = 600  # of a motion in a page: 0.4 KB each
-FULL_EXPRESSION = 3.0  # the coefficient of a named unit's full range, see data/body/PROVENANCE.md
-APART = "LeftMinusRight"
 
 
 def novel_motion(
@@ -90,21 +88,11 @@ def expression_sliders(body_file: Path, count: int) -> dict[str, tuple[float, ..
     """Name -> coefficients of its full range, [count]; left and right apart where the body has both.
 
     A body whose file names nothing gets its first ten coefficients, by number.
+
+    Raises:
+        UserError: the file cannot be read.
     """
-    rows = np.eye(count)
-    try:
-        with np.load(body_file, allow_pickle=False) as archive:
-            units = [str(name) for name in archive["expression_units"]][:count]
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
-        return {f"expression {row + 1}": tuple(2.0 * rows[row]) for row in range(min(count, 10))}
-    found = {}
-    for row, name in enumerate(units):
-        if name.endswith(APART):
-            continue
-        if f"{name}{APART}" in units:  # what is stored is left and right together, and left without right
-            apart = rows[units.index(f"{name}{APART}")]
-            found[f"{name}Left"] = tuple(FULL_EXPRESSION * (rows[row] + apart) / 2)
-            found[f"{name}Right"] = tuple(FULL_EXPRESSION * (rows[row] - apart) / 2)
-        else:
-            found[name] = tuple(FULL_EXPRESSION * rows[row])
-    return found
+    known = read_expressions(body_file, count)
+    if not known.named:
+        return {f"expression {row + 1}": tuple(2.0 * np.eye(count)[row]) for row in range(min(count, 10))}
+    return dict(zip(known.names, map(tuple, known.coefficients.tolist()), strict=True))

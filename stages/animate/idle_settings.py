@@ -12,6 +12,7 @@ _TURNTABLE = ("turntable_frames", "turntable_fps", "arm_angle")
 _WORLDS: Mapping[str, str] = {  # kind of motion -> why its up axis is known
     TURNTABLE: "a turntable has no world of its own",
     "subject": "another subject's clip is seen as its camera saw it",
+    "clip": "a clip is seen as its camera saw it",
     "peers": "a folder of <frame>.json is seen as its camera saw it",
 }
 

@@ -31,8 +31,9 @@ class AnimateSettings:
 
     motion: str = setting(
         TURNTABLE,
-        "a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, subject:NAME (what another subject "
-        "does in its clip), or turntable: the avatar stands still and is turned",
+        "a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, a clip of somebody (its ingest and "
+        "fit are made first), subject:NAME (what another subject does in its clip), or turntable: the avatar "
+        "stands still and is turned",
     )
     outputs: Outputs = setting(
         ("video",),

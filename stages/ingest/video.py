@@ -16,7 +16,6 @@ from pipeline.untrusted import GIGABYTE, bounded_bytes, check_picture
 from stages.ingest.display_matrix import Orientation
 from stages.ingest.video_file import VideoFile, cut_note, open_video, read_video
 
-VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 SKIP = "ingest.damaged=skip"
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 

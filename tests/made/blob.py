@@ -29,7 +29,7 @@ FRAMES = tuple(range(0, 24, 2))  # every second frame of the source was kept
 TEST = FRAMES[-3:]
 WIDTH, HEIGHT = 64, 48
 
-OPTIONAL = ("mesh", "second", "embedder", "arcface", "other_cameras", "rig")
+OPTIONAL = ("mesh", "second", "embedder", "arcface", "other_cameras", "rig", "packed")
 
 
 def stand_in(pose, time):

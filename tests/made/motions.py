@@ -9,6 +9,7 @@ import torch
 
 from pipeline.body import JOINT_NAMES, Poses, joint_index, rest_joints, write_identity, write_poses
 from pipeline.clip.camera import facing_camera
+from pipeline.clip.keypoints import empty_keypoints, write_keypoints
 from pipeline.clip.records import Footage, write_cameras, write_footage
 from pipeline.pose_files import into_camera, read_hand_mean
 from stages.animate.motions.read import DrivenPerson
@@ -77,8 +78,11 @@ def write_folder(folder, rotation, way, pivot, body_file, first=4):
     return folder
 
 
-def write_fitted(root, rotation, way, identity, body, expression=None, turned=None):
-    """Another subject's ingest and fit; ``turned`` [3, 3] turns its world, cameras and all."""
+def write_fitted(root, rotation, way, identity, body, expression=None, turned=None, unseen=()):
+    """Another subject's ingest and fit; ``turned`` [3, 3] turns its world, cameras and all.
+
+    ``unseen``: slices of the whole-body points that no frame shows.
+    """
     folders = {name: root / name for name in ("ingest", "fit")}
     for folder in folders.values():
         folder.mkdir(parents=True)
@@ -98,6 +102,11 @@ def write_fitted(root, rotation, way, identity, body, expression=None, turned=No
     )
     write_identity(folders["fit"] / "identity.safetensors", identity, body)
     write_cameras(folders["ingest"] / "cameras.parquet", dict.fromkeys(frames, camera))
+    keypoints = empty_keypoints(frames)
+    keypoints.whole_body[..., 2] = 1
+    for points in unseen:
+        keypoints.whole_body[:, points] = 0
+    write_keypoints(folders["ingest"] / "keypoints.parquet", keypoints)
     seconds = tuple(row / FPS for row in range(len(way)))
     footage = Footage("clip", 64, 64, 2 * FPS, 1.0, len(way), len(way), {}, 1, seconds, {})
     write_footage(folders["ingest"] / "footage.json", footage)

@@ -67,6 +67,46 @@ def test_a_subject_whose_footage_is_gone_lends_what_the_store_has(toy):
     assert run.returncode != 0 and "nobody" in run.stderr and "Traceback" not in run.stderr
 
 
+def test_a_clip_that_is_named_is_made_a_subject_of_its_own(toy):
+    clip = toy.root / "dance.txt"
+    clip.write_text("jig ")
+    words = ("sing", "subject=ann", f"tune=clip:{clip}")
+    run = toy.doit(*words)
+    assert run.returncode == 0, run.stderr
+    assert sorted(toy.ran()) == ["bend:ann", "bend:dance", "gather:ann", "gather:dance", "sing:ann"]
+    assert song(toy, "ann") == "ann 1.0jig 1.0"
+    assert toy.doit(*words).returncode == 0 and toy.ran() == []
+    assert toy.doit("sing:ann", f"tune=clip:{clip}").returncode == 0 and toy.ran() == []
+    assert not (toy.store / "dance" / "paint").exists()
+
+
+def test_a_clip_with_a_subjects_name_and_other_footage_is_refused(toy):
+    for name, known in (("bob", "there is a subject 'bob'"), ("dance", "the store's 'dance'")):
+        clip = toy.root / "first" / f"{name}.txt"
+        clip.parent.mkdir(exist_ok=True)
+        clip.write_text("jig ")
+        if name == "dance":
+            assert toy.doit("sing", "subject=ann", f"tune=clip:{clip}").returncode == 0
+            clip.write_text("reel ")
+        toy.ran()
+        run = toy.doit("sing", "subject=ann", f"tune=clip:{clip}")
+        assert run.returncode != 0 and known in run.stderr and "Traceback" not in run.stderr
+        assert f"subject:{name}" in run.stderr and toy.ran() == []
+
+
+def test_a_stage_that_is_run_alone_refuses_it_too(toy):
+    clip = toy.root / "bob.txt"
+    clip.write_text("jig ")
+    toy.doit("bend:ann", "subject=ann")
+    with pytest.raises(UserError, match="there is a subject 'bob'"):
+        open_job("ann", toy.request(f"tune=clip:{clip}")).description("sing")
+
+
+def test_a_clip_that_cannot_be_made_stops_what_needs_it(toy):
+    run = toy.doit("sing", "subject=ann", f"tune=clip:{toy.root / 'gone.txt'}")
+    assert run.returncode != 0 and "gone.txt" in run.stderr + run.stdout and "Traceback" not in run.stderr
+
+
 def test_clean_takes_its_results_too(toy):
     toy.doit("sing", "subject=ann")
     assert toy.doit("subject=ann", command="clean").returncode == 0

@@ -75,12 +75,18 @@ def encode_srgb(linear):
 
 def test_only_what_is_asked_for_is_written(studio, walk):
     plain = studio.animate("plain", motion=str(walk))
-    assert names(plain.output) == ["animate.json", "animation.mp4", "cameras.parquet", "frames.png"]
+    assert names(plain.output) == [
+        "animate.json",
+        "animation.mp4",
+        "cameras.parquet",
+        "frames.png",
+        "motion.parquet",
+    ]
     assert set(plain.timings["milliseconds_a_frame"]) == {"pose", "render"}
     frames, rate = video(plain.output / "animation.mp4")
     assert frames.shape == (COUNT, 64, 48, 3) and rate == pytest.approx(FPS)
     splats = studio.animate("splats", motion=str(walk), outputs=("ply",), last_frame=1)
-    assert names(splats.output) == ["animate.json", "cameras.parquet", "frames.png", "ply"]
+    assert names(splats.output) == ["animate.json", "cameras.parquet", "frames.png", "motion.parquet", "ply"]
     assert names(splats.output / "ply") == ["000000.ply", "000001.ply"]
 
 

@@ -1,7 +1,5 @@
 """The report opened from a file in headless Chromium, at the width of a desk and of a phone."""
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -9,12 +7,8 @@ from pipeline.clip.frames import write_png
 from stages.evaluate.scores import TableRow
 from stages.evaluate.second_mask import SecondMask, edge
 from tests.made.blob import TEST, make_clip
+from tests.made.browser import browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-QUIET = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 EVERY_PICTURE = """() => [...document.images].map(one => [one.alt, one.complete && one.naturalWidth > 0])"""
 EVERY_VIDEO = """() => Promise.all([...document.querySelectorAll("video")].map(one => new Promise(done => {
     if (one.error || one.readyState > 0) done(!one.error);
@@ -43,13 +37,8 @@ def report(tmp_path_factory):
 @pytest.fixture(scope="module")
 def chromium():
     """The browser, started once."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium here")
-    with playwright.sync_playwright() as session:
-        browser = session.chromium.launch(executable_path=CHROMIUM, args=list(QUIET))
-        yield browser
-        browser.close()
+    with browser("--disable-gpu") as started:
+        yield started
 
 
 @pytest.fixture(params=[(1280, 800), (390, 844)], ids=["desk", "phone"])

@@ -10,7 +10,7 @@ import torch
 from pipeline.body import pose_body
 from pipeline.clip.clock import frame_times
 from stages.fit import terms
-from stages.fit.registration import register
+from stages.fit.registration import paced, register
 from stages.fit.settings import FitSettings
 from stages.fit.smoothing import smooth, window_of
 from stages.ingest.settings import IngestSettings
@@ -93,6 +93,13 @@ def test_eight_pictures_from_all_sides_are_fitted_as_well_as_without_smoothing(m
     assert float(alone.error.nanmean()) < 1.1 * float(free.error.nanmean()) + 0.1
     assert joint_error(model, turning, alone, smoothed) < 1.2 * joint_error(model, turning, free, free.poses)
     assert float(together.error.nanmean()) > 2 * float(alone.error.nanmean())  # as a film it is far off
+
+
+def test_priors_count_seconds_of_slow_clips_and_frames_of_fast_ones():
+    for rate, step in ((60.0, 1.0), (30.0, 1.0), (15.0, 2.0), (7.5, 4.0)):
+        times = np.arange(10) * 30 / rate
+        np.testing.assert_allclose(np.diff(paced(times)), step)
+    assert paced(np.zeros(1)).tolist() == [0.0]
 
 
 def test_the_prior_costs_the_same_motion_the_same_at_any_rate():

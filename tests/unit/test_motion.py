@@ -16,6 +16,7 @@ from pipeline.body import (
     posed_joints,
     rest_joints,
 )
+from pipeline.clip.keypoints import FACE, LEFT_HAND, empty_keypoints, read_keypoints, write_keypoints
 from pipeline.errors import UserError
 from pipeline.pose_files import read_hand_mean
 from stages.animate.motions.motion import Motion, Span, leg_length
@@ -117,6 +118,60 @@ def test_another_subjects_clip_in_whatever_world_it_stands(tmp_path, truth, pers
         placed = check(motion, truth, person)
         assert torch.equal(placed.expression[:, :4], psi) and not placed.expression[:, 4:].any()
     assert motion.numbers == tuple(range(0, 2 * COUNT, 2))
+
+
+def test_what_a_clip_does_not_show_is_left_out_and_said(tmp_path, truth, person, body):
+    psi = torch.ones(COUNT, 4)
+    unseen = (FACE, LEFT_HAND)
+    folders = write_fitted(tmp_path, *truth, person.identity, body, psi, unseen=unseen)
+    motion = read("subject:other", person, folders=folders)
+    assert motion.expression is None
+    assert {"jaw", "left_eye", "left_ring2"} & set(motion.told) == set() and "right_ring2" in motion.told
+    jaw = joint_index("jaw")
+    assert not motion.rotation[:, [jaw, jaw + 1, jaw + 2]].any()
+    said = " ".join(motion.notes)
+    assert "face" in said and "left hand" in said and "right hand" not in said
+
+
+def test_a_part_that_some_frames_show_is_kept_and_said(tmp_path, truth, person, body):
+    folders = write_fitted(tmp_path, *truth, person.identity, body, torch.ones(COUNT, 4))
+    known = read_keypoints(folders["ingest"] / "keypoints.parquet")
+    known.whole_body[1:, FACE] = 0
+    write_keypoints(folders["ingest"] / "keypoints.parquet", known)
+    motion = read("subject:other", person, folders=folders)
+    assert motion.expression is not None and "jaw" in motion.told
+    assert any(f"{100 / COUNT:.0f}%" in note and "face" in note for note in motion.notes)
+
+
+def test_a_clip_without_keypoints_tells_all_that_its_poses_do(tmp_path, truth, person, body):
+    folders = write_fitted(tmp_path, *truth, person.identity, body, torch.ones(COUNT, 4))
+    frames = read_keypoints(folders["ingest"] / "keypoints.parquet").frames
+    write_keypoints(folders["ingest"] / "keypoints.parquet", empty_keypoints(frames))
+    motion = read("subject:other", person, folders=folders)
+    assert motion.expression is not None and motion.told == JOINT_NAMES and motion.notes == ()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_clip_of_a_frame_or_two(count, tmp_path, truth, person, body):
+    rotation, way = truth
+    folders = write_fitted(tmp_path, rotation[:count], way[:count], person.identity, body)
+    motion = read("subject:other", person, folders=folders)
+    assert len(motion) == count and motion.fps > 0
+    placed = place(motion, body, person.identity)
+    assert bool(placed.rotation.isfinite().all()) and bool(placed.transl.isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("file", "subject"),
+    [
+        ("dance.mp4", "dance"), ("my dance (2).MOV", "my_dance__2_"), ("_x.mkv", "clip_x"),
+        ("été.webm", "clip_t_"), (f"{'long' * 40}.avi", "long" * 25),
+    ],
+)  # fmt: skip
+def test_a_clip_is_a_motion_under_a_subjects_name(file, subject, tmp_path):
+    (tmp_path / file).write_bytes(b"anything")
+    source = motion_source(str(tmp_path / file))
+    assert (source.kind, source.subject, source.path) == ("clip", subject, tmp_path / file)
 
 
 def test_gaps_between_a_folders_frames_come_from_the_neighbours(tmp_path, truth, pivot, person):

@@ -214,7 +214,7 @@ const Viewer = (() => {
       this.repose();
       const basis = this.basis(), data = this.data, step = Math.max(1, this.avatar.count / 4000 | 0);
       for (let i = 0; i < this.avatar.count; i += step) {
-        const place = Posing.times(basis, data[12 * i], data[12 * i + 1], data[12 * i + 2]);
+        const place = Posing.times(basis, data[Posing.TEXEL * i], data[Posing.TEXEL * i + 1], data[Posing.TEXEL * i + 2]);
         for (let c = 0; c < 3; c++) lists[c].push(place[c]);
       }
     }
@@ -257,7 +257,7 @@ const Viewer = (() => {
     recolour() {
       const { count, trust, parts } = this.avatar, data = this.data;
       for (let i = 0; i < count; i++) {
-        const to = 12 * i + 9;
+        const to = Posing.TEXEL * i + 9;
         if (this.colouring === "parts") data.set(this.parts[parts[i]], to);
         else for (let c = 0; c < 3; c++) data[to + c] = trust[i] * data[to + c] + (1 - trust[i]) * GUESSED[c];
       }
@@ -291,7 +291,7 @@ const Viewer = (() => {
     }
 
     draw(camera) {
-      this.renderer.draw(camera, this.avatar.opacity, this.shown, GREY);
+      this.renderer.draw(camera, this.shown, GREY);
     }
 
     count(now) {

@@ -14,14 +14,13 @@ const Drawing = (() => {
     uniform vec3 translation;
     uniform vec4 lens;         // fx, fy, cx, cy, pixels
     uniform vec2 size;         // of the image, pixels
-    uniform float opacity;
     in vec2 corner;
     in uint which;
     out vec2 offset;           // from the mean, pixels
     flat out vec3 conic;
-    flat out vec3 color;
+    flat out vec4 color;       // and opacity
     vec4 texel(uint k) {
-      uint at = 3u * which + k;
+      uint at = 4u * which + k;
       return texelFetch(gaussians, ivec2(at % ${WIDTH}u, at / ${WIDTH}u), 0);
     }
     void main() {
@@ -38,11 +37,12 @@ const Drawing = (() => {
       float xx = dot(jx, seen * jx) + 0.3, xy = dot(jx, seen * jy), yy = dot(jy, seen * jy) + 0.3;
       float determinant = max(xx * yy - xy * xy, 1e-6);
       conic = vec3(0.5 * yy, -xy, 0.5 * xx) / determinant;
-      color = c.yzw;
+      color = vec4(c.yzw, texel(3u).x);
+      if (255.0 * color.a < 1.0) return;
       float middle = 0.5 * (xx + yy), half_ = sqrt(max(middle * middle - determinant, 0.0));
       float long_ = middle + half_, short_ = max(middle - half_, 0.0);
       vec2 axis = abs(xy) > 1e-6 ? normalize(vec2(xy, long_ - xx)) : (xx >= yy ? vec2(1, 0) : vec2(0, 1));
-      float reach = sqrt(2.0 * log(255.0 * opacity));
+      float reach = sqrt(2.0 * log(255.0 * color.a));
       offset = reach * (corner.x * sqrt(long_) * axis + corner.y * sqrt(short_) * vec2(-axis.y, axis.x));
       vec2 pixel = lens.xy * p.xy / p.z + lens.zw + offset;
       gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
@@ -50,16 +50,15 @@ const Drawing = (() => {
 
   const FRAGMENT = `#version 300 es
     precision highp float;
-    uniform float opacity;
     in vec2 offset;
     flat in vec3 conic;
-    flat in vec3 color;
+    flat in vec4 color;
     out vec4 found;
     void main() {
       float sigma = conic.x * offset.x * offset.x + conic.y * offset.x * offset.y + conic.z * offset.y * offset.y;
-      float alpha = min(0.999, opacity * exp(-sigma));
+      float alpha = min(0.999, color.a * exp(-sigma));
       if (alpha < 1.0 / 255.0) discard;
-      found = vec4(alpha * color, alpha);
+      found = vec4(alpha * color.rgb, alpha);
     }`;
 
   function compiled(gl) {
@@ -77,13 +76,13 @@ const Drawing = (() => {
   }
 
   // The numbers of the Gaussians to draw, the farthest first: a counting sort of 16-bit depths.
-  //   data: 12 floats each; shown: 1 for those to draw; camera: see Renderer.draw.
+  //   data: 16 floats each; shown: 1 for those to draw; camera: see Renderer.draw.
   function sorted(data, count, shown, camera, found) {
     const a = camera[12], b = camera[13], c = camera[14], d = camera[17], depths = sorted.depths(count);
     let low = Infinity, high = -Infinity, left = 0;
     for (let i = 0; i < count; i++) {
       if (!shown[i]) continue;
-      const depth = a * data[12 * i] + b * data[12 * i + 1] + c * data[12 * i + 2] + d;
+      const depth = a * data[16 * i] + b * data[16 * i + 1] + c * data[16 * i + 2] + d;
       depths[i] = depth;
       if (depth < low) low = depth;
       if (depth > high) high = depth;
@@ -115,7 +114,7 @@ const Drawing = (() => {
       this.gl = gl;
       this.program = compiled(gl);
       this.uniforms = {};
-      for (const name of ["gaussians", "rotation", "translation", "lens", "size", "opacity"]) {
+      for (const name of ["gaussians", "rotation", "translation", "lens", "size"]) {
         this.uniforms[name] = gl.getUniformLocation(this.program, name);
       }
       this.texture = gl.createTexture();
@@ -136,15 +135,15 @@ const Drawing = (() => {
       gl.vertexAttribDivisor(at, divisor);
     }
 
-    // Takes the Gaussians of a pose, 12 floats each.
+    // Takes the Gaussians of a pose, 16 floats each.
     take(data, count) {
-      const gl = this.gl, rows = Math.ceil(3 * count / WIDTH);
+      const gl = this.gl, rows = Math.ceil(4 * count / WIDTH);
       if (this.rows !== rows) {
         this.room = new Float32Array(4 * WIDTH * rows);
         this.numbers = new Uint32Array(count);
       }
       if (this.numbers.length !== count) this.numbers = new Uint32Array(count);
-      this.room.set(data.subarray(0, 12 * count));
+      this.room.set(data.subarray(0, 16 * count));
       this.data = data;
       this.count = count;
       gl.bindTexture(gl.TEXTURE_2D, this.texture);
@@ -158,7 +157,7 @@ const Drawing = (() => {
     // Draws what was taken.
     //   camera: fx, fy, cx, cy, width, height (pixels of the canvas), rotation by rows, translation.
     //   shown: 1 for each Gaussian to draw; background: RGB in [0, 1].
-    draw(camera, opacity, shown, background) {
+    draw(camera, shown, background) {
       const gl = this.gl, [fx, fy, cx, cy, width, height, ...placed] = camera;
       const left = sorted(this.data, this.count, shown, camera, this.numbers);
       gl.viewport(0, 0, width, height);
@@ -171,7 +170,6 @@ const Drawing = (() => {
       gl.uniform3f(this.uniforms.translation, ...placed.slice(9));
       gl.uniform4f(this.uniforms.lens, fx, fy, cx, cy);
       gl.uniform2f(this.uniforms.size, width, height);
-      gl.uniform1f(this.uniforms.opacity, opacity);
       gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
       gl.bufferData(gl.ARRAY_BUFFER, this.numbers.subarray(0, left), gl.DYNAMIC_DRAW);
       gl.disable(gl.DEPTH_TEST);

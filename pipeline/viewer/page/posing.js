@@ -3,7 +3,7 @@
 "use strict";
 
 const Posing = (() => {
-  const TEXEL = 12; // floats a Gaussian: mean 3, covariance xx xy xz yy yz zz, colour 3
+  const TEXEL = 16; // floats a Gaussian: mean 3, covariance xx xy xz yy yz zz, colour 3, opacity, 3 unused
 
   // Bytes of pipeline/viewer/packed.py -> the avatar; rejects where they are damaged.
   async function unpack(bytes) {
@@ -67,7 +67,7 @@ const Posing = (() => {
       expressionMoves: arrays.expression_moves, // [3 E, M]: point by point, row c E + e
       expressive: arrays.expressive.length, expressionCount: header.expression_count,
       signal: { mean: arrays.signal_mean, components: arrays.signal_components, limits: arrays.signal_limits },
-      trust: arrays.trust, parts: arrays.parts,
+      opacities: arrays.opacities, trust: arrays.trust, parts: arrays.parts,
     };
   }
 
@@ -165,7 +165,7 @@ const Posing = (() => {
     return quaternionMatrix(m[3 * k + j] - m[3 * j + k], ...q);
   }
 
-  // The Gaussians of a pose, 12 floats each (see TEXEL).
+  // The Gaussians of a pose, 16 floats each (see TEXEL).
   //   pose: local, [55][9] rotation matrices; expression; transl.
   function pose(avatar, { local, expression, transl }, found = new Float32Array(TEXEL * avatar.count)) {
     const T = jointTransforms(avatar, local), signal = drivingSignal(avatar, local, expression);
@@ -199,6 +199,7 @@ const Posing = (() => {
         }
         found[to + 9 + r] = 1 / (1 + Math.exp(-(colorLogit[3 * i + r] + six[r])));
       }
+      found[to + 12] = avatar.opacities[i];
       covariance(turnedAxes(m), scales, 3 * i, found, to + 3);
     }
     return found;

@@ -15,6 +15,9 @@ from pipeline.clip.camera import facing_camera
 from pipeline.clip.records import Footage, read_cameras, read_footage
 from pipeline.errors import UserError
 from stages.animate.motions.motion import USUAL_FPS, Motion, Span, leg_length
+from stages.animate.motions.seen_parts import seen_parts
+
+_FACE_JOINTS = [JOINT_NAMES.index(name) for name in ("jaw", "left_eye", "right_eye")]
 
 
 def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: Span) -> Motion:
@@ -37,22 +40,25 @@ def read_fitted(name: str, folders: Mapping[str, Path], body: BodyModel, span: S
     if camera is None:
         raise UserError(f"{folders['ingest']}: frame {poses.frames[0]} has no camera: doit run ingest:{name}")
     own_fps = _rate(read_footage(folders["ingest"] / "footage.json"))
+    clock = () if own_fps else (f"{name}'s clip has no clock: {USUAL_FPS:g} frames a second are taken",)
     rows, fps = span.rows(len(poses), own_fps or USUAL_FPS, f"subject {name}")
+    seen = seen_parts(folders["ingest"], poses, rows)
     turn = facing_camera(1, 1, 1.0).rotation.mT @ camera.rotation
     rotation = poses.rotation[rows].clone()
     rotation[:, 0] = roma.rotmat_to_rotvec(turn @ roma.rotvec_to_rotmat(rotation[:, 0]))
+    rotation[:, _FACE_JOINTS] *= seen.of("face") > 0
     pelvis = poses.transl[rows] + rest_joints(body, identity)[0]
     return Motion(
         name=f"subject {name}",
         fps=fps,
         numbers=tuple(np.asarray(poses.frames)[rows].tolist()),
         rotation=rotation,
-        expression=poses.expression[rows],
+        expression=poses.expression[rows] if seen.of("face") else None,
         root=pelvis @ turn.mT,
         leg=leg_length(body, identity=identity),
-        told=JOINT_NAMES,
+        told=tuple(name for name in JOINT_NAMES if name not in seen.untold()),
         faces_camera=True,
-        notes=() if own_fps else (f"{name}'s clip has no clock: {USUAL_FPS:g} frames a second are taken",),
+        notes=(*seen.notes(name), *clock),
     )
 
 

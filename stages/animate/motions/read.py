@@ -53,7 +53,7 @@ def read_motion(
     Raises:
         UserError: it cannot be read; names the file and the remedy.
     """
-    if name.kind == "subject":
+    if name.subject:
         return read_fitted(name.subject, folders, person.body, span)
     assert name.path is not None
     if name.kind == "bvh":

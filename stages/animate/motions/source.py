@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import stat
 from pathlib import Path
 
+from pipeline.config.choices import VIDEOS
+from pipeline.config.subjects import LONGEST, NAME
 from pipeline.errors import UserError
 
 TURNTABLE = "turntable"
@@ -14,13 +17,13 @@ SUBJECT = "subject:"
 _SHOWN = 200  # characters of a word in a message
 KINDS = {".bvh": "bvh", ".npz": "amass"}
 REMEDY = (
-    "a motion is a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, subject:NAME (what another "
-    "subject does in its clip), or turntable"
+    "a motion is a .bvh file, an AMASS or SMPL-X .npz, a folder of <frame>.json, a clip of somebody (.mp4, "
+    ".mov, .mkv, .webm, .avi), subject:NAME (what another subject does in its clip), or turntable"
 )
 
 
 SUBJECT_FILES = {
-    "ingest": ("footage.json", "cameras.parquet"),
+    "ingest": ("footage.json", "cameras.parquet", "keypoints.parquet"),
     "fit": ("identity.safetensors", "poses.parquet"),
 }
 """Stage -> files that are read of a subject whose clip is the motion."""
@@ -31,9 +34,9 @@ class MotionSource:
     """The kind and the place of a motion.
 
     Attributes:
-        kind: ``turntable``, ``subject``, ``bvh``, ``amass`` or ``peers``.
-        path: the file or the folder, of the last three.
-        subject: whose clip, of ``subject``.
+        kind: ``turntable``, ``subject``, ``clip``, ``bvh``, ``amass`` or ``peers``.
+        path: the file or the folder, of the last four.
+        subject: whose clip, of ``subject``, and the name that a ``clip`` has as a subject.
     """
 
     kind: str
@@ -63,6 +66,8 @@ def motion_source(text: str) -> MotionSource:
         return _folder(path)
     if not stat.S_ISREG(mode):
         raise UserError(f"motion={text}: it is neither a file nor a folder; {REMEDY}")
+    if path.suffix.lower() in VIDEOS:
+        return MotionSource("clip", path.absolute(), clip_name(path))
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise UserError(f"motion={text}: a {path.suffix or 'file without a suffix'} is no motion; {REMEDY}")
@@ -80,6 +85,11 @@ def _folder(path: Path) -> MotionSource:
     return MotionSource("peers", path)
 
 
-def named_subject(text: str) -> str:
-    """The subject whose fit a motion is; empty where it is none."""
-    return text.removeprefix(SUBJECT) if text.startswith(SUBJECT) else ""
+def clip_name(path: Path) -> str:
+    """The name that a clip has as a subject: its file's, with _ for what no subject's name may hold.
+
+    >>> clip_name(Path("my dance (2).mp4"))
+    'my_dance__2_'
+    """
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", path.stem)[:LONGEST]
+    return plain if NAME.fullmatch(plain) else f"clip{plain}"[:LONGEST]

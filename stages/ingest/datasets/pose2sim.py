@@ -18,12 +18,13 @@ import dataclasses
 from pathlib import Path
 
 from pipeline.clip.records import SHOT_STEP
+from pipeline.config.choices import VIDEOS
 from pipeline.config.settings import near
 from pipeline.errors import UserError
 from stages.ingest.cameras.rig import camera_names, read_rig
 from stages.ingest.datasets.recording import Recording, Shot
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import VIDEOS, open_clip
+from stages.ingest.video import open_clip
 
 _REMEDY = "give a folder with videos/ and calibration/"
 

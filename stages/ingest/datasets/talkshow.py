@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.choices import VIDEOS
 from pipeline.errors import UserError
 from pipeline.pose_files import InitialPoses
 from pipeline.untrusted import read_pickle
@@ -32,7 +33,7 @@ from stages.ingest.cameras.calibration import EVERY_FRAME, CalibratedCamera, Cal
 from stages.ingest.datasets.recording import Recording, Shot, entry, numbers, read_array, stacked
 from stages.ingest.datasets.smplx_poses import initial_poses
 from stages.ingest.settings import IngestSettings
-from stages.ingest.video import VIDEOS, Clip, open_clip, read_clip
+from stages.ingest.video import Clip, open_clip, read_clip
 
 _REMEDY = "take SHOW's .pkl again, or leave it out"
 _TO_OPENCV = np.array([-1.0, -1.0, 1.0])
