@@ -32,6 +32,7 @@ from benchmarks.fit_truth import Stage, load_stage
 from pipeline.body import BodyModel, Identity, PointSet, Poses, rest_joints, rest_vertices
 from pipeline.body.eyes import CORNERS, lid_openings
 from pipeline.body.landmarks import locate
+from pipeline.clip.clock import times_of_numbers
 from pipeline.clip.keypoints import Keypoints
 from pipeline.config.workspace import open_workspace
 from pipeline.detection.mediapipe import Estimator, resize
@@ -45,7 +46,7 @@ from stages.ingest.mannequin.footage import Mannequin, make_mannequin
 MOTIONS = {"head": "nod+speech+eyes", "upper": "sway+gesture+eyes"}
 SIZES = {"head": 256, "upper": 384}
 IDENTITIES = (1, 2)
-FRAMES, QUICK_FRAMES = 50, 12
+FRAMES, QUICK_FRAMES = 75, 12
 VARIANTS: dict[str, dict[str, Any]] = {
     "own terms": {},
     "as other points": {"lambda_lids": 0.0, "lambda_gaze": 0.0},
@@ -106,7 +107,8 @@ def fitted_errors(
 ) -> EyeErrors:
     """The errors of one fit of one clip."""
     fitted = register(stage.body, stage.landmarks, keypoints, mannequin.cameras, settings)
-    poses = published_poses(fitted, settings)
+    times = times_of_numbers(keypoints.frames)
+    poses = published_poses(fitted, settings, times)
     return eye_errors(stage, (fitted.identity, poses), (mannequin.truth.identity, mannequin.truth.poses))
 
 
