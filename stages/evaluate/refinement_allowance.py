@@ -17,6 +17,7 @@ from pipeline.clip.curves import CurvePoints
 from pipeline.clip.frames import spread_end_to_end
 from pipeline.clip.plan import Plan
 from pipeline.config.evaluation_protocol import ON, PLAN
+from pipeline.errors import UserError
 from stages.evaluate.evaluated_clip import EvaluatedClip
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.test_pose_refinement import EFFECT
@@ -65,7 +66,10 @@ def allowance(
     frames, steps = clip.split.test, settings.refine_steps
     if asked is False or not frames:
         return Allowance((), 0, "")
-    box = clip.person_box(MARGIN)
+    try:
+        box = clip.person_box(MARGIN)
+    except UserError:  # no mask of a training frame shows anybody: there is nothing to lay a pose on
+        return Allowance((), 0, "")
     work = max(training_steps * box.width * box.height, 1)
     pixels = float(np.mean([clip.cameras[frame].width * clip.cameras[frame].height for frame in frames]))
     count, bound = len(frames), ""

@@ -287,7 +287,7 @@ def test_the_path_is_where_the_store_will_publish(tmp_path):
 
 def test_the_stage_reads_what_it_declares():
     assert STAGE.settings is EvaluateSettings
-    assert STAGE.demands(EvaluateSettings()).assets == ("lpips", "mediapipe")
+    assert STAGE.demands(EvaluateSettings()).assets == ("lpips", "u2netp")
     lean = EvaluateSettings(second_mask="edge", identity=True)
     assert STAGE.demands(lean).assets == ("lpips", "dlib", "identity")
     assert set(STAGE.needs) == {"ingest", "fit", "plan", "train"}

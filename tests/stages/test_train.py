@@ -147,7 +147,12 @@ def test_only_drawn_frames_move(subject, tmp_path):
     assert len(moved) == 2
 
 
-def test_published_avatar_renders_the_held_out_frame(subject, finished, learnt, body):
+def test_published_avatar_renders_the_held_out_frame_as_training_saw_it(subject, kind, body, tmp_path):
+    """Without completion, whose Gaussians are pixels wide in a picture of this size."""
+    context = context_for(subject, tmp_path / "left", **KINDS[kind] | {"unseen": "generated"})
+    stage.run(context)
+    finished = context.output
+    learnt = load_avatar(finished / "avatar.safetensors", body)
     clip = read_fitted_clip(subject / "ingest", subject / "fit", body)
     view = clip.view(5)
     with torch.no_grad():
