@@ -91,8 +91,8 @@ class FitQuality:
             return "no frame was fitted"
         middle = [100 * float(np.median(one)) for one in (self.reprojection, self.covered, self.outside)]
         return (
-            f"its points are off by {middle[0]:.1f}% of the size of the person, covers {middle[1]:.0f}% of "
-            f"the mask and lies outside of it with {middle[2]:.0f}%"
+            f"points {middle[0]:.1f}% of the person's size off, {middle[1]:.0f}% of the mask covered, "
+            f"{middle[2]:.0f}% of the body outside it"
         )
 
 
