@@ -91,7 +91,7 @@ class FitQuality:
             return "no frame was fitted"
         middle = [100 * float(np.median(one)) for one in (self.reprojection, self.covered, self.outside)]
         return (
-            f"points {middle[0]:.1f}% of the person's size off, {middle[1]:.0f}% of the mask covered, "
+            f"points off by {middle[0]:.1f}% of the size of the person, {middle[1]:.0f}% of the mask covered, "
             f"{middle[2]:.0f}% of the body outside it"
         )
 
