@@ -91,8 +91,8 @@ class FitQuality:
             return "no frame was fitted"
         middle = [100 * float(np.median(one)) for one in (self.reprojection, self.covered, self.outside)]
         return (
-            f"points off by {middle[0]:.1f}% of the size of the person, {middle[1]:.0f}% of the mask covered, "
-            f"{middle[2]:.0f}% of the body outside it"
+            f"points off by {middle[0]:.1f}% of the size of the person, {middle[1]:.0f}% of the mask "
+            f"covered, {middle[2]:.0f}% of the body outside it"
         )
 
 
