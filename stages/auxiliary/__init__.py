@@ -5,7 +5,7 @@ from stages.auxiliary.settings import AuxiliarySettings
 
 STAGE = Stage(
     name="auxiliary",
-    version=3,
+    version=4,
     settings=AuxiliarySettings,
     run="stages.auxiliary.run:run",
     needs={

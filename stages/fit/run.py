@@ -102,7 +102,7 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
     kept = None
     if settings.given == "keep" and initial is not None:
         kept = keep_given(initial, body, views_of(keypoints, cameras))
-        settings = dataclasses.replace(settings, iterations=0, face="off")
+        settings = dataclasses.replace(settings, iterations=0, face="off", lambda_lids=0.0, lambda_gaze=0.0)
         context.log("publishes the poses that came with the footage as they are")
     with context.progress(settings.iterations, "registration") as progress:
 

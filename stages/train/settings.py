@@ -53,7 +53,7 @@ IGNORED = {
         "pose_heads_from", "pose_seen_only", "pose_noise", "residual_parts", "residual_moves",
         "residual_from", "residual_width", "residual_place", "residual_size", "place_frequencies",
         "time_frequencies", "time_dropout", "residual_ramp", "plane_deviation", "plane_pose", "learning_rate",
-        "plane_learning_rate",
+        "plane_learning_rate", "pose_scale", "pose_scale_hands", "pose_scale_face",
     ),
 }  # fmt: skip
 """The settings that a representation does not read."""
