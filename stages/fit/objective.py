@@ -8,7 +8,9 @@ its size either.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -23,6 +25,7 @@ from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import Directions, Observations
 from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
 from stages.fit.settings import FitSettings
+from stages.fit.silhouette import BEGIN, EVERY, Silhouette
 from stages.fit.windows import Window, windows
 
 LONG_SIDE = 512.0
@@ -88,9 +91,10 @@ class RegistrationObjective:
         settings: FitSettings,
         target: FaceTerm | None = None,
         times: Tensor | None = None,  # [T] float64, of the frames; by default their numbers
+        silhouette: Silhouette | None = None,
     ) -> None:
         """Prepare what does not change during the optimisation."""
-        self.target = target
+        self.target, self.silhouette = target, silhouette
         self.observations, self.model, self.views = observations, model, views
         self.settings, self.initial = settings, initial
         self.start = initial.matrices
@@ -142,6 +146,7 @@ class RegistrationObjective:
         return {
             "keypoints": self._mean(self._keypoints(predicted, robust, window), window),
             "directions": self._mean(self._directions(predicted, window), window),
+            "silhouette": self._mean(self._silhouette(parameters, predicted, window), window),
             "in_front": self._mean(self._in_front(predicted, window), window),
             "init": settings.lambda_init
             * (
@@ -152,6 +157,17 @@ class RegistrationObjective:
             "sreg": share * settings.lambda_sreg * self._sreg(parameters),
             "smooth": settings.smoothness * self._smooth(parameters, predicted, window),
         }
+
+    def find_outlines(self, step: int, iterations: int, now: Callable[[], Parameters]) -> None:
+        """Find the body's outlines anew where the silhouette term asks for it before a step."""
+        if self.silhouette is None:
+            return
+        steps = {round(share * iterations) for share in np.arange(BEGIN, 1.0, EVERY)}
+        if step in steps:
+            parameters = now()
+            with torch.no_grad():
+                matrices = torch.where(self.movable, parameters.matrices, self.start)
+            self.silhouette.find(parameters, matrices)
 
     def residuals(self, parameters: Parameters) -> Tensor:
         """Reprojection errors, [T, N], pixels of the stored frames; NaN where masked."""
@@ -175,6 +191,12 @@ class RegistrationObjective:
             pixels, target, seen.mask[window.posed], self.saturation if robust else None
         )
         return (error * self.weight[window.posed]).sum(1) / 8
+
+    def _silhouette(self, parameters: Parameters, predicted: Prediction, window: Window) -> Tensor:
+        if self.silhouette is None:
+            return predicted.pixels.new_zeros(len(predicted.pixels))
+        loss = self.silhouette.loss(parameters, predicted.matrices, window.posed)
+        return self.settings.lambda_silhouette * loss / 8
 
     def _directions(self, predicted: Prediction, window: Window) -> Tensor:
         total = predicted.pixels.new_zeros(len(predicted.pixels))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
 
-from pipeline.body import BodyModel, Identity, Landmarks, Poses
+from pipeline.body import BodyModel, Identity, Landmarks, Poses, part_labels
 from pipeline.body.eyes import eyeball, shut_expressions, with_eyeballs
 from pipeline.body.joints import LEFT_EYE, RIGHT_EYE
 from pipeline.clip.camera import Camera
@@ -32,7 +33,9 @@ from stages.fit.objective import FaceTerm, RegistrationObjective
 from stages.fit.observations import Observations, observe
 from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
+from stages.fit.judge import counted_parts
 from stages.fit.settings import FitSettings
+from stages.fit.silhouette import Silhouette, read_fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +75,7 @@ def register(
     log: Callable[[str], None] = lambda note: None,
     source: ClipFrames | None = None,
     times: np.ndarray | None = None,
+    masks: Path | None = None,
 ) -> Registration:
     """Fit the body to a clip.
 
@@ -82,6 +86,7 @@ def register(
         log: told in a line each what else a user should know.
         source: all frames of the footage, which names of given files mean.
         times: [T], of the frames, see :mod:`pipeline.clip.clock`; by default their numbers.
+        masks: the folder of the person's masks, for the silhouette term; None leaves it out.
 
     Raises:
         UserError: a frame has no camera, or there are no frames.
@@ -113,9 +118,13 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
+    silhouette = None
+    if masks is not None and settings.lambda_silhouette:
+        silhouette = _silhouette(body, keypoints, cameras, views, masks, betas, settings)
     objective = RegistrationObjective(
-        body, observations, model, views, initial, movable, settings, face, torch.from_numpy(paced(times))
-    )
+        body, observations, model, views, initial, movable, settings, face, torch.from_numpy(paced(times)),
+        silhouette,
+    )  # fmt: skip
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
@@ -130,6 +139,25 @@ def register(
     error = objective.residuals(fitted)
     seconds, registered = tuple(recorder.seconds), registered_faces(settings, target, start)
     return Registration(identity, poses, observations, error, recorder.curve, seconds, registered, eyes)
+
+
+def _silhouette(
+    body: BodyModel,
+    keypoints: Keypoints,
+    cameras: Mapping[int, Camera],
+    views: CameraBatch,
+    masks: Path,
+    betas: int,
+    settings: FitSettings,
+) -> Silhouette:
+    """The silhouette term of a clip; parts of the body that no trusted keypoint speaks for do not count."""
+    frames = keypoints.frames.tolist()
+    labels = part_labels(body).numpy()
+    points = keypoints.whole_body
+    seen = np.stack([counted_parts(one, settings.score_threshold)[labels] for one in points])
+    return Silhouette(
+        body, read_fields(masks, frames), [cameras[f] for f in frames], views, betas, seen
+    )
 
 
 def _fit_eyes(

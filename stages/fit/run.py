@@ -122,6 +122,7 @@ def fit_clip(context: Context, body: BodyModel, cameras: Mapping[int, Camera]) -
             context.log,
             footage.all_frames,
             times,
+            ingest / "masks",
         )
     if kept is None:
         return fitted

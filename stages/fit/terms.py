@@ -39,6 +39,17 @@ def keypoint_loss(
     return torch.where(mask > 0, error, torch.zeros_like(error))
 
 
+def outline_loss(distance: Tensor, saturation: float) -> Tensor:
+    """The distance of outline points to the outline that was seen, which saturates as ``keypoint_loss`` does.
+
+    Args:
+        distance: signed, pixels, any shape.
+        saturation: upper limit of a point's loss, pixels.
+    """
+    error = torch.sqrt(distance.square() + 1) - 1
+    return error * saturation / (error + saturation)
+
+
 def initial_loss(value: Tensor, initial: Tensor) -> Tensor:
     """L_init, Eq. 3, for one of theta, beta and psi: squared departure from the initial value."""
     return (value - initial).square()

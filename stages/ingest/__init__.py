@@ -13,7 +13,7 @@ def idle(settings: IngestSettings) -> dict[str, str]:
     if settings.mannequin:
         unused = {"long_side", "stride", "max_frames", "layout", "keypoints", "masks", "poses", "cameras",
                   "camera_name", "test_cameras", "camera_scale", "focal", "numbered_from", "body_score",
-                  "mask_area", "estimator_long_side", "estimator_short_side"}  # fmt: skip
+                  "mask_area", "estimator_long_side", "estimator_short_side", "pose_model"}  # fmt: skip
         return dict.fromkeys(sorted(unused), "a mannequin is made up and not filmed: see ingest.mannequin_*")
     found = dict.fromkeys(filming[1:], "it is filmed: ingest.mannequin=full, upper or head makes footage up")
     if settings.masks not in ("auto", "mediapipe"):
@@ -31,7 +31,7 @@ STAGE = Stage(
     version=6,
     settings=IngestSettings,
     run="stages.ingest.run:run",
-    assets=lambda settings: ("mediapipe",) if settings.uses_estimator else (),
+    assets=lambda settings: settings.assets,
     reads_source=lambda settings: not settings.mannequin,
     reads_body=lambda settings: bool(settings.mannequin),
     path_settings=("keypoints", "masks", "cameras", "mannequin_motion", "poses"),

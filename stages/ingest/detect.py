@@ -24,6 +24,7 @@ from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
 from stages.ingest.people_search import NATIVE_LOG, expected_frames, search_people
 from stages.ingest.person_detector import Person
+from stages.ingest.settings import HEAVY
 from stages.ingest.stills import are_stills, detects_singly
 from stages.ingest.video import Clip, SourceFrame, missing_frames, read_clip
 
@@ -103,7 +104,8 @@ class FrameDetector:
         )
         self.estimator = None
         if sources.mediapipe is not None:
-            self.estimator = Estimator(sources.mediapipe, context.work / NATIVE_LOG, singly)
+            log, heavy = context.work / NATIVE_LOG, context.assets.get(HEAVY)
+            self.estimator = Estimator(sources.mediapipe, log, singly, heavy)
         self.agreements: list[Agreement] = []
 
     def detect_frame(self, picture: SourceFrame) -> FrameDetections | str:

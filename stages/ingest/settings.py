@@ -26,6 +26,9 @@ Layout = Literal[
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 """The layouts of ``stages/ingest/datasets``, in the order in which a folder is tried."""
 
+HEAVY = "pose_heavy"
+"""The asset that holds MediaPipe's heavy pose model."""
+
 TestFraction = Annotated[float, Field(ge=0, le=0.9)]
 FirstNumber = Annotated[int, Field(ge=-1, le=1_000_000_000)]
 Focal = Annotated[float, Field(ge=0.1, le=100)]
@@ -75,6 +78,9 @@ class IngestSettings:
     )
     camera_scale: UnitScale = setting(
         0.0, "metres a unit of cameras without a scale; 0 finds it from the person"
+    )
+    pose_model: Literal["full", "heavy"] = setting(
+        "full", "MediaPipe's model of the body: full, or heavy, which takes half as long again"
     )
     estimator_long_side: EstimatorSide = setting(
         1920, "larger pictures are reduced to this for the estimator"
@@ -130,3 +136,10 @@ class IngestSettings:
     def uses_estimator(self) -> bool:
         """True where MediaPipe may have to look at the footage."""
         return not self.mannequin and bool({"mediapipe", "auto"} & {self.keypoints, self.masks})
+
+    @property
+    def assets(self) -> tuple[str, ...]:
+        """The names of the weights that it needs."""
+        if not self.uses_estimator:
+            return ()
+        return ("mediapipe", HEAVY) if self.pose_model == "heavy" else ("mediapipe",)

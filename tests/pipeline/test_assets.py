@@ -25,11 +25,13 @@ def make_wheel(path, members):
             wheel.writestr(name, content)
 
 
-def declare(workspace, archive, members=("pkg/data/*",), root="pkg/data", sha256=None):
+def declare(
+    workspace, archive, members=("pkg/data/*",), root="pkg/data", sha256=None, package="no-such-package==1"
+):
     sha256 = sha256 or digest.of_file(archive)
     listed = ", ".join(f'"{member}"' for member in members)
     (workspace.data / "assets.toml").write_text(
-        f'[thing]\ntitle = "a thing"\nlicence = "CC0"\npackage = "no-such-package==1"\nroot = "{root}"\n'
+        f'[thing]\ntitle = "a thing"\nlicence = "CC0"\npackage = "{package}"\nroot = "{root}"\n'
         f'members = [{listed}]\narchives = [{{ name = "{archive.name}", sha256 = "{sha256}" }}]\n'
     )
     return assets.find_asset(workspace, "thing")
@@ -102,6 +104,43 @@ def test_offline_with_a_cold_cache_the_error_names_the_file_and_where_to_put_it(
         assets.fetch(workspace, asset)
 
 
+@pytest.fixture
+def registry(tmp_path, monkeypatch):
+    """A folder that stands for npm's registry, with one package."""
+    archive = tmp_path / "npm" / "@people" / "thing" / "-" / "thing-1.0.0.tgz"
+    archive.parent.mkdir(parents=True)
+    with tarfile.open(archive, "w:gz") as tar:
+        info = tarfile.TarInfo("package/a.tflite")
+        info.size = 3
+        tar.addfile(info, io.BytesIO(b"abc"))
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "npm").as_uri() + "/")
+    return archive
+
+
+def declare_npm(workspace, archive, sha256=None):
+    package = f"npm:@people/thing@{archive.stem.rpartition('-')[2]}"
+    return declare(workspace, archive, ("package/*.tflite",), "package", sha256, package)
+
+
+def test_a_package_of_npm_comes_from_the_registry_that_the_user_set(workspace, registry):
+    folder = assets.fetch(workspace, declare_npm(workspace, registry))
+    assert (folder / "a.tflite").read_bytes() == b"abc"
+    registry.unlink()
+    assert assets.require(workspace, "thing") == folder  # nothing is asked again
+
+
+def test_a_package_of_npm_that_is_not_the_pinned_one_is_refused(workspace, registry):
+    with pytest.raises(UserError, match="SHA-256"):
+        assets.fetch(workspace, declare_npm(workspace, registry, sha256="0" * 64))
+    assert not (workspace.assets / "thing").exists()
+
+
+def test_a_package_that_npm_lacks_is_named_and_where_to_put_it(workspace, registry):
+    lacking = declare_npm(workspace, registry.with_name("thing-2.0.0.tgz"), sha256="0" * 64)
+    with pytest.raises(UserError, match=r"archives/thing-2.0.0.tgz.*Put that file there"):
+        assets.fetch(workspace, lacking)
+
+
 def test_an_unknown_asset_shows_the_near_ones(workspace, tmp_path):
     make_wheel(tmp_path / "a.whl", {"pkg/data/a.txt": "a"})
     declare(workspace, tmp_path / "a.whl")
@@ -113,5 +152,5 @@ def test_what_the_project_pins_is_well_formed():
     pinned = assets.load_assets(open_workspace(data=REPOSITORY / "data"))
     assert {"mediapipe", "lpips", "smile", "carphone", "balance"} <= set(pinned)
     for asset in pinned.values():
-        assert "==" in asset.package and asset.licence
+        assert ("==" in asset.package or asset.package.startswith("npm:")) and asset.licence
         assert asset.archives and all(len(sha256) == 64 for sha256 in asset.archives.values())
