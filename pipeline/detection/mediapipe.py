@@ -85,9 +85,7 @@ class Estimate:
 class Estimator:
     """Follows one person through a clip; pictures must come in order, unless each stands for itself."""
 
-    def __init__(
-        self, asset: Path, native_log: Path, still: bool = False, heavy: Path | None = None
-    ) -> None:
+    def __init__(self, asset: Path, native_log: Path, still: bool = False, heavy: Path | None = None) -> None:
         """Load the models from the asset's folder; UserError if they cannot be loaded.
 
         Args:

@@ -25,7 +25,7 @@ def idle(settings: FitSettings) -> dict[str, str]:
 
 STAGE = Stage(
     name="fit",
-    version=9,
+    version=10,
     settings=FitSettings,
     run="stages.fit.run:run",
     needs={

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -25,10 +24,10 @@ from stages.fit.joint_limits import joint_limits
 from stages.fit.observations import Directions, Observations
 from stages.fit.parameters import EYES, HANDS, LandmarkModel, Parameters
 from stages.fit.settings import FitSettings
-from stages.fit.silhouette import BEGIN, EVERY, Silhouette
+from stages.fit.silhouette import Silhouette
+from stages.fit.terms import LONG_SIDE
 from stages.fit.windows import Window, windows
 
-LONG_SIDE = 512.0
 CHEST_DISTANCE = 0.22  # metres; a hand seen before the torso is nearer than the shoulders by this
 INITIAL_BETAS = 0.5
 EXPRESSION = 25.0
@@ -91,7 +90,7 @@ class RegistrationObjective:
         settings: FitSettings,
         target: FaceTerm | None = None,
         times: Tensor | None = None,  # [T] float64, of the frames; by default their numbers
-        silhouette: Silhouette | None = None,
+        silhouette: Silhouette | None = None,  # None: without masks
     ) -> None:
         """Prepare what does not change during the optimisation."""
         self.target, self.silhouette = target, silhouette
@@ -160,14 +159,9 @@ class RegistrationObjective:
 
     def find_outlines(self, step: int, iterations: int, now: Callable[[], Parameters]) -> None:
         """Find the body's outlines anew where the silhouette term asks for it before a step."""
-        if self.silhouette is None:
-            return
-        steps = {round(share * iterations) for share in np.arange(BEGIN, 1.0, EVERY)}
-        if step in steps:
+        if self.silhouette is not None and step in self.silhouette.steps(iterations):
             parameters = now()
-            with torch.no_grad():
-                matrices = torch.where(self.movable, parameters.matrices, self.start)
-            self.silhouette.find(parameters, matrices)
+            self.silhouette.find(parameters, torch.where(self.movable, parameters.matrices, self.start))
 
     def residuals(self, parameters: Parameters) -> Tensor:
         """Reprojection errors, [T, N], pixels of the stored frames; NaN where masked."""

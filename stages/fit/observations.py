@@ -43,7 +43,7 @@ HAND_BONES = PALM_BONES + tuple((a, a + 1) for first in (1, 5, 9, 13, 17) for a 
 _BODY_SCALE = 4.0  # there are few body points beside 478 of the face, and each carries a limb
 _MESH_WEIGHT, _FACE68_WEIGHT, _HAND_WEIGHT = 0.3, 1.0, 0.8
 # The palm's direction weighs much: seen in 2D alone, a hand turned the wrong way is a minimum of its own.
-_LIMB_DIRECTION, _PALM_DIRECTION, _FINGER_DIRECTION = 20.0, 10.0, 0.2
+_LIMB_DIRECTION, _PALM_DIRECTION, _FINGER_DIRECTION = 60.0, 10.0, 0.2
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pipeline.body import BodyModel, Identity, Landmarks, Poses, part_labels
+from pipeline.body import BodyModel, Identity, Landmarks, Poses
 from pipeline.body.eyes import eyeball, shut_expressions, with_eyeballs
 from pipeline.body.joints import LEFT_EYE, RIGHT_EYE
 from pipeline.clip.camera import Camera
@@ -29,11 +29,11 @@ from stages.fit.face import FaceTarget, fit_face
 from stages.fit.face_offset import on_skin, spread_matrix
 from stages.fit.initialise import continuous, initial_parameters, with_face
 from stages.fit.initialise_from_poses import initial_facing, initial_from_files
+from stages.fit.judge import counted_parts
 from stages.fit.objective import FaceTerm, RegistrationObjective
 from stages.fit.observations import Observations, observe
 from stages.fit.outlier_frames import mask_outlier_frames
 from stages.fit.parameters import Parameters, landmark_model, movable_joints
-from stages.fit.judge import counted_parts
 from stages.fit.settings import FitSettings
 from stages.fit.silhouette import Silhouette, read_fields
 
@@ -152,12 +152,8 @@ def _silhouette(
 ) -> Silhouette:
     """The silhouette term of a clip; parts of the body that no trusted keypoint speaks for do not count."""
     frames = keypoints.frames.tolist()
-    labels = part_labels(body).numpy()
-    points = keypoints.whole_body
-    seen = np.stack([counted_parts(one, settings.score_threshold)[labels] for one in points])
-    return Silhouette(
-        body, read_fields(masks, frames), [cameras[f] for f in frames], views, betas, seen
-    )
+    counted = np.stack([counted_parts(one, settings.score_threshold) for one in keypoints.whole_body])
+    return Silhouette(body, read_fields(masks, frames), [cameras[f] for f in frames], views, betas, counted)
 
 
 def _fit_eyes(

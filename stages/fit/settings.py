@@ -35,7 +35,7 @@ class FitSettings:
     lambda_sface: Weight = setting(1.0, "weight of the distance to the face that was fitted first (Eq. 1)")
     lambda_lids: Weight = setting(1.0, "weight of the lids' gaps against the priors; 0: lids as other points")
     lambda_gaze: Weight = setting(1.0, "weight of the irises' places against the priors; 0: as other points")
-    lambda_silhouette: Weight = setting(1.0, "weight of the body's outline against the masks', less clothes")
+    lambda_silhouette: Weight = setting(2.0, "weight of the body's outline against the masks', less clothes")
     lambda_sreg: Weight = setting(1.0, "weight of shape, joint offsets and left-right symmetry (Eq. 1)")
     smoothness: Weight = setting(1.0, "factor on accelerations and velocities")
 

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+LONG_SIDE = 512.0  # pixels; errors in the picture are measured as if its long side were this
+
 
 def keypoint_loss(
     projected: Tensor,  # [T, N, 2]

@@ -28,6 +28,7 @@ CASES = {
     "keypoint_loss, saturating": lambda x: terms.keypoint_loss(
         x[..., :2], random(T, N, 2, seed=1), MASK, torch.full((N,), 2.0, dtype=torch.float64)
     ),
+    "outline_loss": lambda x: terms.outline_loss(x, 20.0),
     "initial_loss": lambda x: terms.initial_loss(x, random(T, N, 3, seed=1)),
     "rotation_loss": lambda x: terms.rotation_loss(
         roma.rotvec_to_rotmat(x), roma.rotvec_to_rotmat(random(T, N, 3, seed=1))

@@ -7,7 +7,10 @@ from pipeline.errors import UserError
 
 
 def folders(tmp_path):
-    heavy, models = tmp_path / "pose_heavy", tmp_path / "mediapipe" / "mediapipe" / "modules" / "pose_landmark"
+    heavy, models = (
+        tmp_path / "pose_heavy",
+        tmp_path / "mediapipe" / "mediapipe" / "modules" / "pose_landmark",
+    )
     heavy.mkdir()
     (heavy / HEAVY_MODEL).write_bytes(b"weights")
     models.mkdir(parents=True)
