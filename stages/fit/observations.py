@@ -44,6 +44,7 @@ _BODY_SCALE = 4.0  # there are few body points beside 478 of the face, and each 
 _MESH_WEIGHT, _FACE68_WEIGHT, _HAND_WEIGHT = 0.3, 1.0, 0.8
 # The palm's direction weighs much: seen in 2D alone, a hand turned the wrong way is a minimum of its own.
 _LIMB_DIRECTION, _PALM_DIRECTION, _FINGER_DIRECTION = 60.0, 10.0, 0.2
+_GUESSED_DIRECTION = 20.0  # of a limb that reaches out of the picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +144,8 @@ def _from_mediapipe(
     group = np.repeat([0, 1, 2, 3], [33, 21, 21, 478])
     weight = np.concatenate([_pose_weights(), np.full(42, _HAND_WEIGHT), np.full(478, _MESH_WEIGHT)])
     limbs = _directions(world[..., :3], LIMBS, 0, _both(world_mask, LIMBS))
-    limbs.weight.mul_(_LIMB_DIRECTION)
+    both_seen = torch.from_numpy(_both(visible(pose, threshold, sizes), LIMBS))
+    limbs.weight.mul_(torch.where(both_seen, _LIMB_DIRECTION, _GUESSED_DIRECTION))
     limbs.weight[:, _limbs_of_hips()] *= torch.from_numpy(pose_mask[:, POSE_HIPS].any(1)).float()[:, None]
     return _assemble(
         keypoints,

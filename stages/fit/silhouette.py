@@ -5,7 +5,8 @@ show where they end. Points on the outline of the posed body are drawn towards t
 clothes add: how far a segment's outline lies inside the masks in the median over the clip and over both sides
 of the body. So clothes widen no body, and a body that stands too far left in one frame moves right.
 
-Head and hands are left out: hair is no part of the body, and both have points enough of their own.
+Head and hands are left out: hair is no part of the body, and both have points enough of their own. Limbs that
+no keypoint speaks for neither count nor turn.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from pipeline.body import (
     rasterize,
     transform_points,
 )
+from pipeline.body.parts import joint_parts
 from pipeline.clip.camera import Camera
 from pipeline.clip.frames import read_mask
 from stages.fit.camera_batch import CameraBatch
@@ -124,6 +126,7 @@ class Silhouette:
         self.shape = body.shape_directions[..., :betas]
         self.segment, self.part = segments(body), part_labels(body).numpy()
         self.counted = counted & ~np.isin(PARTS, _LEFT_OUT)
+        self.held = torch.from_numpy(self.counted[:, joint_parts().numpy()])[..., None, None]
         self.outlines: Outlines | None = None
 
     @staticmethod
@@ -156,6 +159,8 @@ class Silhouette:
         if self.outlines is None:
             return parameters.transl.new_zeros(len(matrices))
         vertices, weight = self.outlines.vertices[rows], self.outlines.weight[rows]
+        # A shoulder's outline would else swing an arm that nobody sees.
+        matrices = torch.where(self.held[rows], matrices, matrices.detach())
         distance = self._distance(self._posed(parameters, matrices, vertices), rows)
         return (outline_loss(distance + self.outlines.clothes[rows], SATURATION) * weight).sum(1)
 

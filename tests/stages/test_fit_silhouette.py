@@ -74,14 +74,15 @@ def standing(body: BodyModel, shift: torch.Tensor) -> Parameters:
     return parameters_of(torch.zeros(T, 55, 3), transl, sizes)
 
 
-def silhouette(body: BodyModel) -> Silhouette:
-    """The term of a clip whose masks show a body that stands still."""
+def silhouette(body: BodyModel, parts: tuple[str, ...] = PARTS) -> Silhouette:
+    """The term of a clip whose masks show a body that stands still; keypoints speak for ``parts``."""
     camera = facing_camera(SIZE, SIZE, focal=1.2 * SIZE)
     vertices = body.v_template + standing(body, torch.zeros(T, 3)).transl[0]
     mask = 255 * rasterize(camera.resized(256, 256), vertices, body.faces).covered.astype(np.uint8)
     fields = DistanceFields(signed_distance(mask).expand(T, -1, -1))
     cameras = [camera] * T
-    return Silhouette(body, fields, cameras, stack(cameras), 4, np.ones((T, len(PARTS)), bool))
+    counted = np.tile([part in parts for part in PARTS], (T, 1))
+    return Silhouette(body, fields, cameras, stack(cameras), 4, counted)
 
 
 def loss_of(term: Silhouette, parameters: Parameters) -> torch.Tensor:
@@ -101,8 +102,16 @@ def test_a_body_beside_its_mask_is_drawn_back(body):
 
 
 def test_what_no_keypoint_speaks_for_does_not_count(body):
-    term = silhouette(body)
-    term.counted[:, :] = False
-    aside = standing(body, torch.full((T, 3), 0.05))
+    term, aside = silhouette(body, parts=()), standing(body, torch.full((T, 3), 0.05))
     term.find(aside, aside.matrices)
     assert not loss_of(term, aside).any()
+
+
+def test_a_shoulders_outline_swings_no_arm_that_nobody_sees(body):
+    row = joint_index("left_shoulder") - 1
+    for parts, swings in ((("torso",), False), (PARTS, True)):
+        term, aside = silhouette(body, parts), standing(body, torch.full((T, 3), 0.05)).leaves()
+        term.find(aside, aside.matrices)
+        loss_of(term, aside).sum().backward()
+        assert aside.body_pose.grad[:, row].any().item() is swings
+        assert aside.transl.grad.any()
