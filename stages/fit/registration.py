@@ -121,6 +121,9 @@ def register(
     recorder.begin(initial)
     rate, size = settings.learning_rate, settings.minibatch
     fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
+    if settings.iterations:
+        left = ", ".join(f"{name} {value:.3g}" for name, value in objective.values(fitted).items())
+        log(f"objective in the end: {left}")
     identity, poses = _outcome(objective, fitted, spread)
     identity = with_eyeballs(body, identity) if bool(seen[on_face].any()) else identity
     eyes = _fit_eyes(body, landmarks, objective, fitted, identity)
