@@ -104,6 +104,8 @@ def run(context: Context) -> None:
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
+    if settings.protocol != "ours" and not settings.arcface:
+        context.log("faces are not compared (FC): evaluate.arcface=FILE names ArcFace's ONNX file")
     animate, mesh = baked_animation(avatar), make_mesh(context, clip)
     rig = avatar_rig(avatar, clip.body, context.body_file, relaxed(clip, settings))
     evaluate(

@@ -113,6 +113,7 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
+    log(described_start(settings, body, betas, start))
     objective = RegistrationObjective(
         body, observations, model, views, initial, movable, settings, face, torch.from_numpy(paced(times))
     )
@@ -163,6 +164,14 @@ def registered_faces(settings: FitSettings, target: FaceTarget | None, start: In
         return int(target.valid.sum())
     given = start is not None and start.expression is not None and settings.face != "off"
     return int(start.valid.sum()) if given and start is not None else 0
+
+
+def described_start(settings: FitSettings, body: BodyModel, betas: int, start: InitialPoses | None) -> str:
+    """The line of the log that says where poses start and how many coefficients are fitted."""
+    where = "poses that were given" if start is not None else "keypoints; fit.pose_init names given poses"
+    fewer = f", for the body has no more than these of {settings.betas}" if betas < settings.betas else ""
+    count = body.expression_directions.shape[2]
+    return f"fits {betas} betas{fewer} and {count} of expression, from {where}"
 
 
 def paced(times: np.ndarray) -> np.ndarray:

@@ -79,8 +79,11 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
         trainer.run()
     for name, value in timer.summary(first, trainer.iteration).items():
         context.timing(name, value)
-    gate = trainer.hooks.get("gate")
-    publish(trainer, curve.curve, gate if isinstance(gate, VisibilityGate) else None, context.output)
+    hook = trainer.hooks.get("gate")
+    gate = hook if isinstance(hook, VisibilityGate) else None
+    if gate is not None and gate.threshold is not None:
+        log(f"visibility gate: {gate.threshold.why}; {len(trainer.avatar)} Gaussians are left")
+    publish(trainer, curve.curve, gate, context.output)
 
 
 def log_computing(context: Context, device: torch.device) -> None:
@@ -120,9 +123,7 @@ def build_trainer(
     drawn = frames_to_draw(data, settings.iterations * settings.batch, settings.visits)
     if len(drawn) < len(data.clip.split.train):
         log(f"draws the {len(drawn)} most different of {len(data.clip.split.train)} training frames")
-    scene = read_scene(data.clip, data.crops.box) if settings.scene_share else None
-    if settings.scene_share and scene is None:
-        log("the camera moves: frames are compared over drawn colours alone")
+    scene = read_scene(data.clip, data.crops.box, log) if settings.scene_share else None
     data = dataclasses.replace(data, drawn=drawn, scene=scene)
     refinement = PoseRefinement(moved(data.poses, device), data.clip.split.train)
     avatar, data = initial_avatar(data, refinement, settings, log)

@@ -78,6 +78,15 @@ def require_face_loss(contexts):
     assert len(values) and np.isfinite(values).all() and (values > 0).all()
 
 
+def require_named(contexts):
+    """What the preset asks for and cannot have here stands in the log, with what to write."""
+    assert says(contexts["fit"], r"(fit\.flame_model)") and says(
+        contexts["fit"], r"no more than these of (100)"
+    )
+    assert says(contexts["plan"], r"^set, not decided by the clip: .*(face loss)")
+    assert says(contexts["train"], r"^(no scene|scene)")
+
+
 def test_files_of_133_points_alone(tmp_path, shown):
     folder, take = tmp_path / "clip", shown.still
     names = [f"{row}.png" for row in range(COUNT)]
@@ -92,6 +101,7 @@ def test_files_of_133_points_alone(tmp_path, shown):
     sface = says(contexts["fit"], r"^objective in the end: .*\bsface ([\d.e+-]+)")
     assert len(sface) == 1 and float(sface[0]) > 0
     require_face_loss(contexts)
+    require_named(contexts)
 
 
 def test_fits_that_came_with_the_footage(tmp_path, shown):
