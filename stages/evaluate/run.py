@@ -22,7 +22,6 @@ from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
 from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
-from pipeline.metrics.arcface import ArcFace
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
@@ -37,7 +36,7 @@ from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
 from stages.evaluate.exports import Rig, avatar_rig, write_exports
-from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer
+from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer, open_arcface
 from stages.evaluate.methods import (
     AVATAR,
     REFINED,
@@ -104,8 +103,6 @@ def run(context: Context) -> None:
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
     networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
-    if settings.protocol != "ours" and not settings.arcface:
-        context.log("faces are not compared (FC): evaluate.arcface=FILE names ArcFace's ONNX file")
     animate, mesh = baked_animation(avatar), make_mesh(context, clip)
     rig = avatar_rig(avatar, clip.body, context.body_file, relaxed(clip, settings))
     evaluate(
@@ -119,7 +116,7 @@ def run(context: Context) -> None:
         embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
-        arcface=ArcFace(Path(settings.arcface)) if settings.arcface else None,
+        arcface=open_arcface(settings.arcface, settings.protocol, context.log),
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
         rig=rig,

@@ -80,9 +80,8 @@ def require_face_loss(contexts):
 
 def require_named(contexts):
     """What the preset asks for and cannot have here stands in the log, with what to write."""
-    assert says(contexts["fit"], r"(fit\.flame_model)") and says(
-        contexts["fit"], r"no more than these of (100)"
-    )
+    assert says(contexts["fit"], r"(fit\.flame_model)")
+    assert says(contexts["fit"], r"no more than these of (100)")
     assert says(contexts["plan"], r"^set, not decided by the clip: .*(face loss)")
     assert says(contexts["train"], r"^(no scene|scene)")
 
