@@ -91,7 +91,6 @@ VARIANTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "all of 3": ("3", {**BALANCE, **LOGARITHMS, **NO_SCALE_CHANGE}),
     "all of 6": ("6", {**LEARNT, **OPACITY, **CORRECTIVES, **PLACES, **ZERO, **RAMP}),
     "scene": ("7", {"train.scene_share": "0"}),
-    "psi's limit": ("4", {"fit.expressions": "1000"}),
     "pictures' balance": ("3", BALANCE),
     "scales in metres": ("3", LOGARITHMS),
     "size of pose's scales": ("3", NO_SCALE_CHANGE),
@@ -101,6 +100,7 @@ VARIANTS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "open coordinates": ("6", PLACES),
     "planes of zero": ("6", ZERO),
     "residuals' ramp": ("6", RAMP),
+    "psi's limit": ("4", {"fit.expressions": "1000"}),
 }
 """What a row is without -> the item of issue 20 that it is, and the settings."""
 

@@ -168,10 +168,10 @@ def registered_faces(settings: FitSettings, target: FaceTarget | None, start: In
 
 def described_start(settings: FitSettings, body: BodyModel, betas: int, start: InitialPoses | None) -> str:
     """The line of the log that says where poses start and how many coefficients are fitted."""
-    where = "poses that were given" if start is not None else "keypoints; fit.pose_init names given poses"
-    fewer = f", for the body has no more than these of {settings.betas}" if betas < settings.betas else ""
+    where = "the poses that were given" if start is not None else "keypoints; fit.pose_init names given poses"
     count = body.expression_directions.shape[2]
-    return f"fits {betas} betas{fewer} and {count} of expression, from {where}"
+    fewer = betas < settings.betas or count < settings.expressions
+    return f"fits {betas} betas and {count} expressions{', all that the body has' * fewer}, from {where}"
 
 
 def paced(times: np.ndarray) -> np.ndarray:

@@ -81,9 +81,10 @@ def require_face_loss(contexts):
 def require_named(contexts):
     """What the preset asks for and cannot have here stands in the log, with what to write."""
     assert says(contexts["fit"], r"(fit\.flame_model)")
-    assert says(contexts["fit"], r"no more than these of (100)")
+    assert says(contexts["fit"], r"^fits 16 betas .*(all that the body has)")
     assert says(contexts["plan"], r"^set, not decided by the clip: .*(face loss)")
     assert says(contexts["train"], r"^(no scene|scene)")
+    assert says(contexts["train"], r"^learns from \d+ captured and (\d+) generated") == ["0"]
 
 
 def test_files_of_133_points_alone(tmp_path, shown):
