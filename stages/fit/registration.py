@@ -113,7 +113,8 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
-    log(described_start(settings, body, betas, start))
+    if settings.iterations:
+        log(described_start(settings, body, betas, start))
     objective = RegistrationObjective(
         body, observations, model, views, initial, movable, settings, face, torch.from_numpy(paced(times))
     )

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.clip.curves import read_curve
 from pipeline.clip.keypoints import read_keypoints
-from pipeline.clip.plan import read_plan
+from pipeline.clip.plan import read_plan, write_plan
 from pipeline.config.settings import read_toml
 from pipeline.config.workspace import REPOSITORY
 from stages.fit.run import run as run_fit
@@ -27,6 +27,7 @@ from stages.train.settings import TrainSettings
 from tests.made import layouts
 from tests.made.context import stage_context
 from tests.made.layout_footage import COUNT, footage
+from tests.made.plans import plan_of
 from tests.made.videos import ingest_context
 
 PRESET = read_toml(REPOSITORY / "data" / "presets" / "paper.toml")
@@ -83,8 +84,21 @@ def require_named(contexts):
     assert says(contexts["fit"], r"(fit\.flame_model)")
     assert says(contexts["fit"], r"^fits 16 betas .*(all that the body has)")
     assert says(contexts["plan"], r"^set, not decided by the clip: .*(face loss)")
-    assert says(contexts["train"], r"^(no scene|scene)")
+    assert says(contexts["train"], r"^(no scene|scene)") and says(contexts["train"], r"^computes on (cpu)")
     assert says(contexts["train"], r"^learns from \d+ captured and (\d+) generated") == ["0"]
+
+
+def require_named_without_face_loss(trained, folder):
+    """Where the plan has none of it, the log says that lambda_face does nothing."""
+    plan = folder / "other" / "plan"
+    plan.mkdir(parents=True)
+    write_plan(plan / "plan.json", plan_of(face_loss=False))
+    inputs = {**trained.inputs, "plan": plan}
+    context = stage_context("train", trained.settings, folder / "other" / "train", inputs)
+    run_train(context)
+    assert says(context, r"^no face loss, though train.face is ([\d.]+)") == ["0.8"]
+    assert not says(context, r"^objective: .*\bface ([\d.]+)")
+    assert "face" not in read_curve(context.output / "curve.parquet", "run training again")
 
 
 def test_files_of_133_points_alone(tmp_path, shown):
@@ -112,3 +126,4 @@ def test_fits_that_came_with_the_footage(tmp_path, shown):
     record = json.loads((contexts["fit"].output / "face.json").read_text(encoding="utf-8"))
     assert record == {"source": "given", "frames": COUNT, "registered": COUNT}
     require_face_loss(contexts)
+    require_named_without_face_loss(contexts["train"], tmp_path)
