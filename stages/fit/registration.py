@@ -121,8 +121,9 @@ def register(
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
-    rate, size = settings.learning_rate, settings.minibatch
-    fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
+    fitted = optimise(
+        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, recorder
+    )
     if settings.iterations:
         left = ", ".join(f"{name} {value:.3g}" for name, value in objective.values(fitted).items())
         log(f"objective in the end: {left}")
