@@ -119,7 +119,7 @@ def register(
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
     silhouette = None
-    if masks is not None and settings.lambda_silhouette:
+    if masks is not None and settings.lambda_silhouette and settings.iterations:
         silhouette = _silhouette(body, keypoints, cameras, views, masks, betas, settings)
     if settings.iterations:
         log(described_start(settings, body, betas, start))
