@@ -59,7 +59,9 @@ QUICK = (GOOD, "still", "dim")
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One take of one person; dB, means over moments, and LPIPS x100 from the front.
+    """One take of one person, means over moments: dB, and LPIPS x100 by side.
+
+    A blurred back has more dB than a sharp one that lies a few pixels off; LPIPS sees it the other way round.
 
     Attributes:
         frames: that the fit accepted for training.
@@ -75,7 +77,10 @@ class Row:
     turned: float
     side: float
     behind: float
-    lpips: float
+    lpips_front: float
+    lpips_turned: float
+    lpips_side: float
+    lpips_behind: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,8 +176,9 @@ def compared(
                 if degrees:
                     image = shifted(image, shown.alpha, mask)
                 scores.setdefault(side, []).append(psnr(image[part], picture[part]))
+                perceived = 100 * float(network(image[part], picture[part]))
+                scores.setdefault(f"lpips_{side}", []).append(perceived)
                 if not degrees:
-                    scores.setdefault("lpips", []).append(100 * float(network(image[part], picture[part])))
                     for what, boxes in truth.boxes(row, camera).items():
                         found = [psnr(image[box.slices], picture[box.slices]) for box in boxes]
                         scores.setdefault(what, []).extend(found)
