@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -147,6 +147,12 @@ def seen_from(camera: Camera, away: float) -> Camera:
     return dataclasses.replace(camera, intrinsics=intrinsics)
 
 
+def _trembling(seconds: float) -> tuple[float, float]:
+    """How far a held camera is aside and down, -1 to 1 each."""
+    aside = 0.6 * math.sin(2.1 * seconds + 0.3) + 0.4 * math.sin(7.3 * seconds + 1.0)
+    return aside, 0.6 * math.sin(1.7 * seconds + 2.0) + 0.4 * math.sin(6.1 * seconds + 0.2)
+
+
 def through_the_camera(picture: np.ndarray, take: Take, number: int) -> np.ndarray:
     """A picture [H, W, 3] in 0 to 255 with what camera and file do to it: uint8."""
     height, width = picture.shape[:2]
@@ -155,9 +161,7 @@ def through_the_camera(picture: np.ndarray, take: Take, number: int) -> np.ndarr
     picture = picture.astype(np.float32)
     if take.shake:
         reach = take.shake * width / 512
-        course: Callable[[float, float], float] = lambda quick, phase: math.sin(quick * seconds + phase)  # noqa: E731
-        along = reach * (0.6 * course(2.1, 0.3) + 0.4 * course(7.3, 1.0))
-        down = reach * (0.6 * course(1.7, 2.0) + 0.4 * course(6.1, 0.2))
+        along, down = (reach * course for course in _trembling(seconds))
         matrix = np.array([[1, 0, along], [0, 1, down]], np.float32)
         picture = cv2.warpAffine(picture, matrix, (width, height), borderMode=cv2.BORDER_REFLECT)
     if take.drift:
