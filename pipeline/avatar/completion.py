@@ -24,6 +24,7 @@ from pipeline.avatar.surface import Surface
 from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import Segments, find_segments
 
+FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
 
@@ -69,7 +70,7 @@ def completed_values(decoded: Decoded, evidence: Evidence, covers: float) -> Dec
     log_scale, shape_trust = _arrays(decoded.log_scale, evidence.shape_trust)
     found = torch.from_numpy(complete_colors(segments, *told))
     logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
-    scales = complete_log_scales(segments, log_scale, shape_trust, covers)
+    scales = complete_log_scales(segments, log_scale, shape_trust, (covers, covers, FLAT))
     return dataclasses.replace(
         decoded,
         color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
