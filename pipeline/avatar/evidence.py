@@ -101,7 +101,6 @@ class Evidence:
             normals=self.normals,
         )
 
-
     def with_colors_of(self, other: Evidence) -> Evidence:
         """This evidence, trusting also the colours that the other's frames showed, as of the avatar as it is."""
         better = (other.frames > self.frames)[:, None]
