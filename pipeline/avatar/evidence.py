@@ -102,7 +102,7 @@ class Evidence:
         )
 
     def with_colors_of(self, other: Evidence) -> Evidence:
-        """This evidence, trusting also the colours that the other's frames showed, as of the avatar as it is."""
+        """This evidence, trusting also the colours that the other shows, as of the avatar as it is."""
         better = (other.frames > self.frames)[:, None]
         return dataclasses.replace(
             self,

@@ -275,6 +275,8 @@ class TrainingObjective:
         the face in front.
         """
         decoded = self.avatar.decode(level)
+        if self.settings.unseen == "generated":  # as training leaves it
+            return decoded
         shown = decoded.surface.pick(self.avatar.trust)[:, :1] > 0
         logits = decoded.color_logit
         return dataclasses.replace(decoded, color_logit=torch.where(shown, logits, logits.detach()))
