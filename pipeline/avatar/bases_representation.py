@@ -40,6 +40,9 @@ class BasesRepresentation(Representation):
     """
 
     half_stored = frozenset({"offset", "log_scale", "color", "bases", "base_color", "trust"})
+    offset: nn.Parameter
+    log_scale: nn.Parameter
+    color: nn.Parameter
     signal_mean: Tensor
     signal_components: Tensor
     signal_limits: Tensor
@@ -178,9 +181,10 @@ class BakedBases(BakedRepresentation):
 
 def _driven(signal: DrivingSignal, expressions: int, condition: Condition) -> Tensor:
     """The driving signal of a frame, [K]."""
-    told = {"theta": condition.theta.detach(), "the expression": condition.expression.detach()}
+    theta, expression = condition.theta.detach(), condition.expression.detach()
+    told = {"theta": theta, "the expression": expression}
     require_finite(told, "posing", "in the driving signal", "mend the motion or the pose")
-    return signal(signal_features(*told.values(), expressions))
+    return signal(signal_features(theta, expression, expressions))
 
 
 def _change(

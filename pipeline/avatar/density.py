@@ -71,7 +71,7 @@ def choose_splits(faces: Tensor, projections: Projections, longest: float) -> tu
         projections: of the mesh's vertices.
         longest: pixels; no edge that is shown stays longer, unless ``MOST_ROUNDS`` were not enough.
     """
-    rounds = []
+    rounds: list[Tensor] = []
     while len(rounds) < MOST_ROUNDS and len(faces):
         pairs = edges(faces)
         chosen = pairs[projections.edge_pixels(pairs) > longest]

@@ -124,10 +124,3 @@ def read_fit_quality(folder: Path) -> FitQuality:
     if len(frames) and not columns["accepted"].any():
         raise UserError(f"{path} accepts no frame: {_REMEDY}")
     return FitQuality(frames, **columns)
-
-
-def good_fit(frames: Sequence[int] | np.ndarray) -> FitQuality:
-    """A fit that is right in every one of some frames: what made-up clips have."""
-    ones = np.ones(len(frames))
-    accepted = np.ones(len(frames), bool)
-    return FitQuality(np.array(frames, np.int64), ones, 100 * ones, ones, ones, 0 * ones, accepted)

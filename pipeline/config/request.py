@@ -143,7 +143,7 @@ def parse_request(words: Iterable[str] | Mapping[str, str], subject: str = "") -
 
 
 def _pairs(words: Iterable[str]) -> dict[str, str]:
-    pairs = {}
+    pairs: dict[str, str] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals:

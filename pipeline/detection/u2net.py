@@ -15,7 +15,8 @@ from pipeline.errors import UserError, first_line
 
 MODEL = "u2netp.onnx"
 SIDE = 320  # pixels of the picture that the network sees
-_MEAN, _DEVIATION = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])
+_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+_DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 _FAINT = 0.3  # a network's answer whose brightest pixel is darker is not stretched: nothing stands out
 
 

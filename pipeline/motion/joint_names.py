@@ -123,9 +123,9 @@ def match_joints(
     for side in _SIDES:
         for chain in _CHAINS:
             options = [sorted(places[side, part]) for part in chain]
-            for part, place in zip(chain, _along(options, chain, tree), strict=True):
-                if place is not None:
-                    found[f"{side}_{part}"] = place
+            for part, joint in zip(chain, _along(options, chain, tree), strict=True):
+                if joint is not None:
+                    found[f"{side}_{part}"] = joint
     found |= _middle(places, found, tree)
     _check(names, found, origin)
     return {joint: found[joint] for joint in JOINT_NAMES if joint in found}

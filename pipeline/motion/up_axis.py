@@ -8,6 +8,7 @@ body stands most of the time. Where they disagree, the ground decides: people st
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import get_args
 
 import roma
 import torch
@@ -21,10 +22,9 @@ _TURNS: Mapping[UpAxis, tuple[float, float, float]] = {  # rotation vectors that
     "-x": (0, 0, -_QUARTER), "-y": (2 * _QUARTER, 0, 0), "-z": (_QUARTER, 0, 0),
 }  # fmt: skip
 AXES: Mapping[UpAxis, Tensor] = {
-    f"{sign}{letter}": (-1.0 if sign else 1.0) * torch.eye(3, dtype=torch.float64)["xyz".index(letter)]
-    for sign in ("", "-")
-    for letter in "xyz"
-}  # type: ignore[assignment]
+    axis: (-1.0 if axis[0] == "-" else 1.0) * torch.eye(3, dtype=torch.float64)["xyz".index(axis[-1])]
+    for axis in get_args(UpAxis)
+}
 
 _STANDS = 0.7  # mean cosine between the body and an axis from which on it is said to stand along it
 _ON_GROUND = 0.25  # distance from height zero, of a leg's length

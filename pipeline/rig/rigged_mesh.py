@@ -134,7 +134,7 @@ def _corners(body: BodyModel, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         return source, corners.reshape(-1, 3), np.zeros((len(source), 0), np.float32)
     pairs = np.stack([faces, body.uv_faces.numpy()[kept]], -1).reshape(-1, 2)
     unique, corners = np.unique(pairs, axis=0, return_inverse=True)
-    uv = body.uv.numpy()[unique[:, 1]] * np.float32([1, -1]) + np.float32([0, 1])
+    uv = body.uv.numpy()[unique[:, 1]] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
     return unique[:, 0], corners.reshape(-1, 3), uv
 
 

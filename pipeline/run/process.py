@@ -117,11 +117,14 @@ def process_environment() -> dict[str, str]:
 
     A process that has it is given the same again. The malloc thresholds keep large activations on the heap
     instead of asking the kernel for fresh zeroed pages at every step; they must be set before Python starts.
+    Threads that wait sleep: beside other jobs one that spins holds the core that its partner waits for, and
+    a training step of two threads took twenty times as long (docs/results.md, "Crowded machines").
     """
     defaults = {
         "MALLOC_MMAP_THRESHOLD_": "4294967296",
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
+        "OMP_WAIT_POLICY": "PASSIVE",
     }
     # Once only: a process that starts itself again until its environment is this one must come to an end.
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)

@@ -76,8 +76,8 @@ def measured_of(subject: str, request: Request) -> Measured | None:
         return None
     summary = read_summary(artifact.folder)
     mask = summary.get("choices", {}).get("render_mask", OWN)
-    how = (str(one) for one in (summary.get("protocol", ""), summary.get("background", "black"), mask))
-    return Measured(held_out_means(summary), *how, current=current is not None)
+    protocol, background = str(summary.get("protocol", "")), str(summary.get("background", "black"))
+    return Measured(held_out_means(summary), protocol, background, str(mask), current=current is not None)
 
 
 def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> str:

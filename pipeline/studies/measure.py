@@ -185,7 +185,7 @@ def score_table(
     Returns:
         Columns are the keys of ``METRICS``; ``train_s`` and ``whole_s`` are processor seconds.
     """
-    rows = [one.held_out(method) | speeds.get(one.folders.get("train"), {}) for one in results]
+    rows = [one.held_out(method) | speeds.get(one.folders.get("train", Path()), {}) for one in results]
     scores = pd.DataFrame(rows, range(len(rows))).reindex(columns=list(METRICS)).astype(float)
     scores["train_s"] = [one.training_cost for one in results]
     scores["whole_s"] = [math.nan if one.failure else sum(one.cpu_seconds.values()) for one in results]

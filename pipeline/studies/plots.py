@@ -61,8 +61,8 @@ def scatter(
     for name, x in (expected or {}).items():
         if x <= REACH * points["x"].max():
             axes.axvline(x, color=ORANGE, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-            place = {"rotation": 90, "transform": axes.get_xaxis_transform()}
-            axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, **place)
+            beside = axes.get_xaxis_transform()  # x in the data's units, y from 0 to 1
+            axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, rotation=90, transform=beside)
     _log_axis(axes, points["x"])
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
     figure.canvas.draw()  # places the axes, which labels are moved in

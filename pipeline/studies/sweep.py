@@ -144,8 +144,8 @@ def _gaussians(settings: Settings) -> Iterator[Level]:
     own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
     for count, label in enumerate(SUBDIVISIONS):
         if label != mesh:  # "at most one": nobody knows yet whether it is none or one
-            overrides = (("train.subdivisions", str(count)), ("plan.subdivision", "on"))
-            yield Level(GAUSSIANS, mesh, label, overrides, 1.8 ** (count - own))
+            finer = (("train.subdivisions", str(count)), ("plan.subdivision", "on"))
+            yield Level(GAUSSIANS, mesh, label, finer, 1.8 ** (count - own))
 
 
 def mesh_of(settings: Settings) -> str:

@@ -169,7 +169,7 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
-    if hasattr(train, "held_out_every"):
+    if train is not None:
         tenth = max(1, train.iterations // 10) if train.iterations else train.held_out_every
         lean["train.held_out_every"] = str(min(train.held_out_every, tenth))
     changed = any(not name.startswith("evaluate.") for name in own)

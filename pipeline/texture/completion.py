@@ -204,7 +204,7 @@ def _ring_means(along: np.ndarray, around: np.ndarray, values: np.ndarray, weigh
 
 def _kernel(away: np.ndarray, widths: tuple[tuple[float, float], ...]) -> np.ndarray:
     """Gaussians of several widths, each with its share, summed."""
-    return sum(share * np.exp(-0.5 * (away / width) ** 2) for width, share in widths)
+    return np.sum([share * np.exp(-0.5 * (away / width) ** 2) for width, share in widths], axis=0)
 
 
 def weighted_median(

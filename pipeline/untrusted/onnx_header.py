@@ -101,7 +101,7 @@ def _text(message: memoryview, field: int) -> str:
 def _shape(value: memoryview) -> tuple[int, ...]:
     """The sides of a ValueInfoProto's tensor; 0 where one is free."""
     shape = _inner(_inner(_inner(value, 2), 1), 2)
-    sides = []
+    sides: list[int] = []
     for field, dimension in _fields(shape):
         if field == 1 and isinstance(dimension, memoryview) and len(sides) < _MOST_DIMENSIONS:
             numbers = [side for number, side in _fields(dimension) if number == 1 and isinstance(side, int)]

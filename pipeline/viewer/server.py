@@ -83,7 +83,7 @@ class ViewServer(ThreadingHTTPServer):
     @property
     def local(self) -> bool:
         """Whether nothing but this machine can reach it."""
-        return ipaddress.ip_address(self.server_address[0]).is_loopback
+        return ipaddress.ip_address(str(self.server_address[0])).is_loopback
 
     @property
     def url(self) -> str:

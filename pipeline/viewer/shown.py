@@ -35,8 +35,8 @@ def novel_motion(
 def posed_motion(name: str, fps: float, poses: Poses) -> ViewedMotion:
     """A motion of so many poses, the first ``MOST_FRAMES`` of them."""
     some = slice(0, MOST_FRAMES)
-    arrays = (one[some].numpy() for one in (poses.rotation, poses.expression, poses.transl))
-    return ViewedMotion(name, fps, *arrays)
+    rotation, expression = poses.rotation[some].numpy(), poses.expression[some].numpy()
+    return ViewedMotion(name, fps, rotation, expression, poses.transl[some].numpy())
 
 
 def filmed_motion(

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,7 +65,8 @@ def numbered(folder: Path) -> dict[int, Path]:
 
 def _ours(path: Path, frames: Path) -> GeneratorOutput:
     # Whatever their poses came from, the pictures were made from them.
-    files, poses = numbered(frames), dataclasses.replace(read_poses(path / "poses.parquet"), valid=None)
+    files, told = numbered(frames), read_poses(path / "poses.parquet")
+    poses = Poses(told.frames, told.rotation, told.expression, told.transl)
     cameras = read_cameras(path / "cameras.parquet")
     masks = numbered(path / "masks") if (path / "masks").is_dir() else {}
     usable = [frame for frame in poses.frames if frame in files and frame in cameras]

@@ -102,7 +102,7 @@ def run(context: Context) -> None:
     photographed = settings.choices.edge_colors == PHOTOGRAPH
     clip = read_evaluated_clip(context.inputs, context.body_file, photographed)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
-    networks = {name: Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
+    networks = {str(name): Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
     animate, mesh = baked_animation(avatar), make_mesh(context, clip)
     rig = avatar_rig(avatar, clip.body, context.body_file, relaxed(clip, settings))
@@ -157,7 +157,9 @@ def other_camera_rows(
     if not camera_folders(clip):
         return []
     start = time.monotonic()
-    methods = [AvatarMethod(AVATAR, clip, animate, ()), *([mesh] if mesh is not None else [])]
+    methods: list[AvatarMethod | TexturedMesh] = [AvatarMethod(AVATAR, clip, animate, ())]
+    if mesh is not None:
+        methods.append(mesh)
     background = context.settings.choices.background
     rows = list(score_other_cameras(clip, methods, read_true_surface(clip), background))
     context.timing("views_seconds", time.monotonic() - start)
@@ -255,7 +257,8 @@ def score(
 ) -> list[TableRow]:
     """The scores of the clip; ``comparisons`` gets the pictures that are shown."""
     frames = frames_to_score(clip, context.settings.training_frames)
-    start, rows = time.monotonic(), []
+    start = time.monotonic()
+    rows: list[TableRow] = []
     with context.progress(len(frames), "scoring") as progress:
         for scored in score_clip(clip, methods, scorer, frames, *faces):
             rows += scored.rows

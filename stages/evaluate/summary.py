@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.config.evaluation_protocol import PHOTOGRAPH, PROTOCOLS, TRUTH, Protocol
+from pipeline.config.evaluation_protocol import PHOTOGRAPH, PROTOCOLS, TRUTH, Protocol, ProtocolName
 from pipeline.metrics import EROSION
 from pipeline.run.stage import Context
 from stages.evaluate.evaluated_clip import EvaluatedClip
@@ -68,20 +68,20 @@ def summarise(
     }
 
 
-def protocol_sentences(choices: Protocol, refined: RefinedTestPoses, name: str = "") -> str:
+def protocol_sentences(choices: Protocol, refined: RefinedTestPoses, name: ProtocolName | None = None) -> str:
     """The choices behind the numbers in sentences, for the report and for ``summary.json``.
 
     Args:
         choices: what was chosen.
         refined: the refined test poses.
-        name: of the protocol.
+        name: of the protocol, if it has one.
     """
     return " ".join(
         part for part in (_named(name, choices), *_composited(choices), _refined(refined)) if part
     )
 
 
-def _named(name: str, choices: Protocol) -> str:
+def _named(name: ProtocolName | None, choices: Protocol) -> str:
     if not name:
         return ""
     changed = "" if PROTOCOLS[name] == choices else ", some of its choices changed"

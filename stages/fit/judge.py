@@ -76,9 +76,10 @@ def measure_fit(
         shares = overlap(drawn.face, shrunk > 127, counted[labels])
         rows.append((0 if seen is None else len(seen), size, off, *shares))
         advance()
-    points, size, off, covered, outside = np.array(rows, np.float64).reshape(len(rows), 5).T
+    columns = np.array(rows, np.float64).reshape(len(rows), 5).T
+    measured = dict(zip(("points", "size", "error", "covered", "outside"), columns, strict=True))
     every = np.ones(len(rows), bool)
-    quality = FitQuality(np.array(poses.frames, np.int64), points, size, off, covered, outside, every)
+    quality = FitQuality(np.array(poses.frames, np.int64), **measured, accepted=every)
     return dataclasses.replace(quality, accepted=quality.passed)
 
 

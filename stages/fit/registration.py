@@ -119,8 +119,9 @@ def register(
     frozen = frozen_groups(settings, face_is_seen=bool((seen & on_face).any()))
     recorder = Recorder(objective, settings.iterations, report)
     recorder.begin(initial)
-    rate, size = settings.learning_rate, settings.minibatch
-    fitted = optimise(objective, initial, settings.iterations, frozen, rate, size, recorder)
+    fitted = optimise(
+        objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, recorder
+    )
     identity, poses = _outcome(objective, fitted, spread)
     identity = with_eyeballs(body, identity) if bool(seen[on_face].any()) else identity
     eyes = _fit_eyes(body, landmarks, objective, fitted, identity)

@@ -70,7 +70,7 @@ def _filtered(pairs: Iterable[Pair], name: str, arguments: str) -> Iterator[Pair
 
     Frames of another size or format than those before begin anew.
     """
-    tags: collections.deque[Tag] = collections.deque()
+    tags: collections.deque = collections.deque()  # of Tag
     graph, form = None, None
     for tag, frame in pairs:
         if graph is not None and form != (frame.width, frame.height, frame.format.name):

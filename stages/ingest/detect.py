@@ -16,12 +16,12 @@ from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import BODY, Keypoints, empty_keypoints
 from pipeline.detection.mediapipe import Estimate, Estimator, estimator_scale, resize
 from pipeline.detection.wholebody import PixelLandmarks, inside_picture, to_keypoints, to_pixels
-from stages.ingest import people
 from stages.ingest.external_detections import DetectionSources, check_frames
 from stages.ingest.keypoint_check import OFF_FRAME, Agreement, check_agreement, choose_person
 from stages.ingest.mask_files import read_given_mask
 from stages.ingest.mask_polarity import with_mask_form
 from stages.ingest.masks import write_segmentations
+from stages.ingest.people import ClipPeople, Track, hide_others, subject_region
 from stages.ingest.people_search import NATIVE_LOG, expected_frames, search_people
 from stages.ingest.person_detector import Person
 from stages.ingest.stills import are_stills, detects_singly
@@ -62,7 +62,7 @@ class DetectedClip:
     dropped: dict[str, int]
     people: int
     stills: bool = False
-    subject: people.Track | None = None
+    subject: Track | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +89,7 @@ class FrameDetector:
         context: Context,
         clip: Clip,
         sources: DetectionSources,
-        found: people.ClipPeople,
+        found: ClipPeople,
         singly: bool = False,
     ) -> None:
         """Load the estimator if the sources need it; ``singly``: it looks at each frame by itself."""
@@ -110,7 +110,7 @@ class FrameDetector:
         """The person in a frame, or the reason why the frame is dropped."""
         if self.people.absent(picture.index):
             return ABSENT
-        own = people.subject_region(picture.index, self.people, self.clip.width, self.clip.height)
+        own = subject_region(picture.index, self.people, self.clip.width, self.clip.height)
         estimate = self._estimate(picture, own)
         if self.sources.keypoints is not None:
             return self._given_person(picture, estimate, own)
@@ -158,7 +158,7 @@ class FrameDetector:
     def _estimate(self, picture: SourceFrame, own: np.ndarray | None) -> Estimate | None:
         if self.estimator is None:
             return None
-        shown = people.hide_others(picture.image, own)
+        shown = hide_others(picture.image, own)
         if self.people.subject is None or not self.people.others:
             return self.estimator.estimate(resize(shown, self.estimator_scale))
         box = self._neighbourhood(self.people.subject.at(picture.index))
@@ -211,7 +211,7 @@ def detect(
     clip: Clip,
     sources: DetectionSources,
     raw_masks: Path,
-    choose: Callable[[Sequence[people.Track]], people.Track] | None = None,
+    choose: Callable[[Sequence[Track]], Track] | None = None,
 ) -> DetectedClip:
     """Detect the person in every frame; write kept frames to ``output/frames``, raw masks to ``raw_masks``.
 

@@ -12,7 +12,7 @@ import struct
 
 import av
 import numpy as np
-from av.sidedata.sidedata import Type
+from av.sidedata.sidedata import SideData, Type
 
 _ASKEW = 1.0  # degrees off a quarter turn that are told
 
@@ -53,7 +53,7 @@ class Orientation:
 def orientation_of(frame: av.VideoFrame) -> Orientation:
     """The orientation that a frame's display matrix asks for; upright where it has none."""
     for item in frame.side_data:
-        if item.type == Type.DISPLAYMATRIX and len(bytes(item)) >= 36:
+        if isinstance(item, SideData) and item.type == Type.DISPLAYMATRIX and len(bytes(item)) >= 36:
             a, b, _, c, d, *_ = struct.unpack("=9i", bytes(item)[:36])
             return from_matrix(a, b, c, d)
     return Orientation()

@@ -80,14 +80,14 @@ def open_keypoints(
     files = visible_files(path, (".json",)) if path.is_dir() else [path]
     if not files:
         kinds = sorted({file.suffix for file in path.iterdir() if file.is_file() and file.suffix})
-        found = f" (but {', '.join(kinds[:4])} files)" if kinds else ""
-        raise UserError(f"{path} holds no numbered .json file{found}: check ingest.keypoints")
+        others = f" (but {', '.join(kinds[:4])} files)" if kinds else ""
+        raise UserError(f"{path} holds no numbered .json file{others}: check ingest.keypoints")
     if len(files) == 1:
         tables = _tables(files[0])
         if tables is not None:
-            match = match_names(tables, clip, files[0], counted_from)
-            of_frames = {frame: tables[name] for name, frame in match.frames.items()}
-            return GivenKeypoints(dict.fromkeys(of_frames, files[0]), of_frames), match
+            names = match_names(tables, clip, files[0], counted_from)
+            of_frames = {frame: tables[name] for name, frame in names.frames.items()}
+            return GivenKeypoints(dict.fromkeys(of_frames, files[0]), of_frames), names
     if not path.is_dir():
         raise UserError(f"{path} is of one frame: ingest.keypoints is a folder of such files, one a frame")
     found, match = match_files(path, (".json",), clip, counted_from)

@@ -115,7 +115,8 @@ def _complete(alpha: np.ndarray, image: np.ndarray, part: BodyPart) -> np.ndarra
         return alpha
     cv2.setRNGSeed(0)  # its clusters start at random
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(image[box]), label, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    no_box = (0, 0, 0, 0)  # the labels say where to begin
+    cv2.grabCut(np.ascontiguousarray(image[box]), label, no_box, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
     found = np.isin(label, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.float32)
     gained = np.where(near, np.maximum(own, cv2.GaussianBlur(found, (0, 0), SOFT)), own)
     whole = alpha.copy()

@@ -129,8 +129,7 @@ def _read_video(clip: Clip, stride: int) -> Iterator[SourceFrame]:
     assert clip.video is not None
     nothing = np.zeros((clip.height, clip.width, 3), np.uint8)
     for place, seconds, image in read_video(clip.video, stride):
-        whole = image is not None
-        yield SourceFrame(clip.first + place, seconds, image if whole else nothing, not whole)
+        yield SourceFrame(clip.first + place, seconds, nothing if image is None else image, image is None)
 
 
 def _open_folder(path: Path) -> Clip:

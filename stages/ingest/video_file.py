@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -139,7 +139,7 @@ def _whole_frames(video: VideoFile) -> Iterator[tuple[int, av.VideoFrame]]:
         following = max(following, place + 1)
 
 
-def _decode(path: Path, index: int) -> Iterator[tuple[bool, av.VideoFrame | None]]:
+def _decode(path: Path, index: int) -> Generator[tuple[bool, av.VideoFrame | None]]:
     """The stream's frames in order of showing, each with whether its data are damaged; None for a lost one.
 
     One thread decodes: those that take a frame each lose good frames with bad ones, and those that take a
@@ -147,6 +147,7 @@ def _decode(path: Path, index: int) -> Iterator[tuple[bool, av.VideoFrame | None
     """
     with open_container(path) as container:
         stream = container.streams[index]
+        assert isinstance(stream, av.VideoStream)
         stream.thread_type = "NONE"
         if stream.codec_context.name == "mjpeg":  # whose decoder marks nothing
             stream.codec_context.options = {"err_detect": "explode"}

@@ -9,11 +9,12 @@ import numpy as np
 
 from pipeline.body import BodyModel, Identity, Poses, write_identity, write_poses
 from pipeline.clip.camera import Camera
-from pipeline.clip.fit_quality import good_fit, write_fit_quality
+from pipeline.clip.fit_quality import write_fit_quality
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import Keypoints, write_keypoints
 from pipeline.clip.plan import Plan, write_plan
 from pipeline.clip.records import Footage, Split, write_cameras, write_footage, write_split
+from tests.made.fit_quality import good_fit
 from tests.made.plans import plan_of
 
 

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.body import Identity, mean_identity, posed_vertices
 from pipeline.body.rasterize import rasterize
-from pipeline.clip.fit_quality import good_fit, read_fit_quality
+from pipeline.clip.fit_quality import read_fit_quality
 from pipeline.clip.frames import write_frame, write_mask
 from pipeline.clip.keypoints import write_keypoints
 from pipeline.clip.records import SHOT_STEP, Footage, write_cameras, write_footage
@@ -18,6 +18,7 @@ from stages.fit.run import run
 from stages.fit.settings import FitSettings
 from tests.made.context import stage_context
 from tests.made.detections import SIZE, make_clip, whole_body
+from tests.made.fit_quality import good_fit
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ from pipeline.clip.fit_quality import (
     LEAST_COVERED,
     MOST_OUTSIDE,
     MOST_REPROJECTION,
-    good_fit,
     read_fit_quality,
     write_fit_quality,
 )
 from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
 from tests.made.body import open_body
+from tests.made.fit_quality import good_fit
 from tests.made.portrait import write_subject
 
 

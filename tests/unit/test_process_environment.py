@@ -14,3 +14,10 @@ def test_the_environment_of_the_environment_is_itself(monkeypatch):
     for name, value in first.items():
         monkeypatch.setenv(name, value)
     assert process_environment() == first
+
+
+def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert process_environment()["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert process_environment()["OMP_WAIT_POLICY"] == "ACTIVE"

@@ -74,14 +74,16 @@ def read_pose_arrays(path: Path, arrays: Mapping[str, Any]) -> PoseArrays:
         if poses is None or poses.shape[1] not in _LAYOUTS:
             sizes = ", ".join(str(3 * joints) for joints in _LAYOUTS)
             raise _refuse_shape(path, whole, arrays, f"[frames, one of {sizes}], or [frames, joints, 3]")
-        places = [0, *(joint for part in _LAYOUTS[poses.shape[1]] for joint in range(part.start, part.stop))]
-        return _gathered(path, {tuple(places): poses[:, : len(places)]}, [])
+        parts = _LAYOUTS[poses.shape[1]]
+        joints = (0, *(joint for part in parts for joint in range(part.start, part.stop)))
+        return _gathered(path, {joints: poses[:, : len(joints)]}, [])
     root = first(_ROOT, arrays)
     body = first(_BODY, arrays)
     if root is None or body is None:
         missing = _ROOT if root is None else _BODY
         raise UserError(f"{path} has no array '{missing[0]}' (or '{missing[1]}') and no 'poses': {REMEDY}")
-    found, notes = {(0,): _part(path, arrays, root, 1)}, []
+    found: dict[tuple[int, ...], np.ndarray] = {(0,): _part(path, arrays, root, 1)}
+    notes = []
     for names, part in _PARTS.items():
         name = first(names, arrays)
         if name is None:

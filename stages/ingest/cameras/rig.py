@@ -101,7 +101,7 @@ def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
     try:
         matrix = np.array(table["matrix"], np.float64).reshape(3, 3)
         turn = np.array(table["rotation"], np.float64)
-        turn = turn.reshape(3, 3) if turn.size == 9 else cv2.Rodrigues(turn.reshape(3))[0]
+        rotation = turn.reshape(3, 3) if turn.size == 9 else cv2.Rodrigues(turn.reshape(3))[0]
         translation = np.array(table["translation"], np.float64).reshape(3)
         bend = np.array(table.get("distortions", [0.0] * 4), np.float64).reshape(-1)
         size = [int(side) for side in np.array(table["size"]).reshape(2)]
@@ -113,10 +113,10 @@ def _pose2sim(path: Path, table: dict[str, Any]) -> Calibration:
         raise UserError(
             f"{path}: distortions beyond k6 (thin prism, tilt) are not known here: calibrate without"
         )
-    check_rotation(turn, str(path))
+    check_rotation(rotation, str(path))
     # OpenCV counts from the centre of the first pixel.
     lens = _lens(size, [matrix[0, 0], matrix[1, 1]], [matrix[0, 2] + 0.5, matrix[1, 2] + 0.5], list(bend[:8]))
-    return _standing(path, "Pose2Sim", lens, turn, translation)
+    return _standing(path, "Pose2Sim", lens, rotation, translation)
 
 
 def _standing(

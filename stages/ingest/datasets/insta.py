@@ -94,8 +94,8 @@ def read(source: Path, settings: IngestSettings) -> Recording:
         notes += [] if masks else ["no masks, neither in images/ as alpha nor in alpha/"]
     notes += [] if heads else ["no expressions, neither in checkpoint/ nor in flame/exp/"]
     shot = Shot(clip, calibration, None, masks, "white", poses_of(heads))
-    split = [_listed(source, part, clip) for part in ("train", "test")]
-    return Recording("insta", (shot,), *split, notes=tuple(notes))
+    train, test = (_listed(source, part, clip) for part in ("train", "test"))
+    return Recording("insta", (shot,), train, test, notes=tuple(notes))
 
 
 def _another_layout(source: Path) -> UserError:

@@ -24,7 +24,7 @@ from stages.ingest.mannequin.motion import make_motion
 from stages.ingest.mannequin.person import make_identity
 from stages.ingest.mannequin.scene import FilmedFrame, Scene, film, make_background, make_scene
 from stages.ingest.mannequin.simulated_detector import simulate_detections
-from stages.ingest.mannequin.spec import VIEWS, MannequinSpec, mannequin_spec
+from stages.ingest.mannequin.spec import VIEWS, MannequinSpec, UnseenView, mannequin_spec
 from stages.ingest.mannequin.truth import BodyPoints, Truth, point_states, pose_points, write_truth
 from stages.ingest.preview import write_preview
 from stages.ingest.split import split_frames
@@ -99,7 +99,9 @@ class Filming:
         return keypoints, truth
 
 
-def film_view(spec: MannequinSpec, scene: Scene, name: str) -> Iterator[tuple[int, Camera, FilmedFrame]]:
+def film_view(
+    spec: MannequinSpec, scene: Scene, name: UnseenView
+) -> Iterator[tuple[int, Camera, FilmedFrame]]:
     """The frames of a camera that the pipeline never sees: frame number, camera, picture."""
     camera = unseen_camera(scene.shot, name)
     background = make_background(camera, spec.seed + 1 + list(VIEWS).index(name))

@@ -13,7 +13,7 @@ from torch import Tensor
 from pipeline.body import BodyModel, Identity, Poses, joint_index, pose_body
 from pipeline.clip.camera import Camera, facing_camera
 from stages.ingest.mannequin.motion import MannequinMotion
-from stages.ingest.mannequin.spec import VIEWS, MannequinSpec
+from stages.ingest.mannequin.spec import VIEWS, MannequinSpec, UnseenView
 
 FOCAL = {"full": 1.2, "upper": 1.5, "head": 2.2}
 """Focal length over the picture's side: closer framings are filmed with longer lenses."""
@@ -74,7 +74,7 @@ def frame_motion(
     return FramedMotion(camera, centre, poses)
 
 
-def unseen_camera(shot: FramedMotion, name: str) -> Camera:
+def unseen_camera(shot: FramedMotion, name: UnseenView) -> Camera:
     """A camera of ``VIEWS``: the pipeline's own, carried about the middle of what is framed."""
     azimuth, elevation = (math.radians(angle) for angle in VIEWS[name])
     about = roma.euler_to_rotmat("YX", [azimuth, -elevation])
