@@ -38,7 +38,7 @@ from pipeline.config.subjects import known_subjects, load_subject
 from pipeline.errors import UserError
 from pipeline.run.compile_ahead import kernels_ahead, start_compiling
 from pipeline.run.doit_reporter import summarising
-from pipeline.run.effect import VIEW, check_effect, named_tasks, running
+from pipeline.run.effect import VIEW, check_effect, named_tasks, running, with_what_is_viewed
 from pipeline.run.job import (
     Job,
     check_footage,
@@ -207,9 +207,18 @@ def needed_assets(stage: str, subject: str) -> list[str]:
 
 
 def needed_of_others(stage: str, subject: str) -> list[str]:
-    """The tasks whose results of other subjects a stage reads."""
+    """The tasks whose results of other subjects a stage reads.
+
+    Where nothing but what reads a clip is asked for, the subject's other stages wait for the clip, too: one
+    that cannot be used then ends the run before an avatar is trained for it.
+    """
+    readers = {stage}
+    if subject in CHOSEN and BORROWED:
+        asked = with_what_is_viewed(REQUEST, named_tasks(sys.argv[1:], STAGES) or ())
+        kinds = {task.partition(":")[0] for task in asked}
+        readers |= kinds if kinds <= {*ON_REQUEST} else set()
     try:
-        loans = STAGES[stage].demands(job_of(subject).settings[stage]).loans
+        loans = [loan for one in readers for loan in STAGES[one].demands(job_of(subject).settings[one]).loans]
     except UserError:
         return []  # the stage itself reports it
     return [f"{loan.stage}:{loan.subject}" for loan in loans if loan.subject in MADE]

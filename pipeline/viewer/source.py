@@ -16,7 +16,7 @@ from pipeline.clip.frames import frame_path
 from pipeline.clip.records import read_cameras, read_footage
 from pipeline.config.workspace import Workspace
 from pipeline.errors import UserError
-from pipeline.store.artifact import SCRATCH, Store
+from pipeline.store.artifact import SCRATCH, Store, in_use
 from pipeline.untrusted import parse_json
 from pipeline.viewer.packed import ViewedMotion
 from pipeline.viewer.shown import filmed_motion, novel_motion, packed_avatar, posed_motion
@@ -31,7 +31,8 @@ class FoundAvatar:
 
     Attributes:
         path: the file.
-        kind: ``published``, ``training`` or ``shipped``.
+        kind: ``published``, ``shipped``, or a checkpoint's: ``training`` of a run that goes on, ``stopped``
+            of one that was broken off.
         changed: when, seconds since the epoch.
         size: in bytes.
     """
@@ -73,15 +74,20 @@ class AvatarSource:
         """
         published = self.published("train")
         known = None if published is None else _file(published / AVATAR, "published")
-        work = self.store.folder(self.subject, "train").glob(f"{SCRATCH}*/work/{PREVIEW}")
-        previews = [one for one in (_file(path, "training") for path in work) if one is not None]
+        runs = [*self.store.folder(self.subject, "train").glob(f"{SCRATCH}*")]
+        going = {run for run in runs if in_use(run)}
+        files = [_file(run / "work" / PREVIEW, "training" if run in going else "stopped") for run in runs]
+        previews = [one for one in files if one is not None]
         newest = max(previews, key=lambda one: one.changed, default=None)
         if newest is not None and (known is None or newest.changed > known.changed):
             return newest
         known = known or _file(self.shipped / AVATAR, "shipped")
         if known is None:
             who = self.subject
-            raise UserError(f"there is no avatar of '{who}' yet: doit run subject={who} makes it")
+            remedy = f"doit run subject={who} makes it"
+            if going:
+                remedy = "it is being trained, try again after its first checkpoint (train.checkpoint_every=)"
+            raise UserError(f"there is no avatar of '{who}' yet: {remedy}")
         return known
 
     def published(self, stage: str) -> Path | None:
@@ -162,6 +168,8 @@ def said_of(found: FoundAvatar) -> str:
     """A sentence on where the avatar comes from; empty for a published one."""
     if found.kind == "training":
         return f"A checkpoint of the training that runs, {max(0, time.time() - found.changed):.0f} s old."
+    if found.kind == "stopped":
+        return "A checkpoint of a training that was broken off: the command that began it goes on with it."
     return "It comes with the project: nothing was trained here." if found.kind == "shipped" else ""
 
 

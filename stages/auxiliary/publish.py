@@ -108,6 +108,8 @@ def write_records(
     context.log(
         f"{len(frames)} of {accepted.offered} frames kept" + (f"; refused: {counted}" if counted else "")
     )
+    if not frames:
+        context.log("no generated view is learnt from; auxiliary.check=false takes them without these checks")
 
 
 def moved(points: np.ndarray, source: Camera, target: Camera) -> np.ndarray:

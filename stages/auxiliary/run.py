@@ -39,7 +39,6 @@ def run(context: Context) -> None:
     """
     generator = chosen_generator(context)
     if generator == "off":
-        context.log("no auxiliary views are called for")
         return
     shutil.rmtree(context.work / "made", ignore_errors=True)
     clip = read_numbered_clip(context.inputs["ingest"], context.inputs["fit"], context.body_file)
@@ -74,13 +73,18 @@ def chosen_generator(context: Context) -> str:
     """The setting, or what the plan calls for where it is ``auto``; off where there is no plan."""
     generator, plan = context.settings.generator, context.inputs.get("plan")
     called_for = plan is not None and read_plan(plan / "plan.json").on("auxiliary_views")
-    if generator == "off" and called_for:
-        context.log("the plan asks for views that no frame shows: auxiliary.generator=auto makes them")
     if generator == "named":
         return named_generator(context.settings)
-    if generator != "auto":
-        return generator
-    return "texture" if called_for else "off"
+    if generator == "auto":
+        generator = "texture" if called_for else "off"
+    elif generator == "off" and called_for:
+        context.log(
+            "switched off, though the plan asks for views that no frame shows: auxiliary.generator=auto "
+            "makes them"
+        )
+    if generator == "off" and not called_for:
+        context.log("no auxiliary views are called for")
+    return generator
 
 
 def named_generator(settings: AuxiliarySettings) -> str:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
@@ -21,7 +22,7 @@ from pipeline.clip.boxes import Box
 from pipeline.clip.composite import BACKGROUNDS, BLACK, WHITE, cut_out, to_bytes
 from pipeline.config.evaluation_protocol import OWN, TRUTH
 from pipeline.finite import require_finite
-from pipeline.metrics.arcface import five_points
+from pipeline.metrics.arcface import ArcFace, five_points
 from pipeline.metrics.face_identity import RecognizedFace, identity_cosine, identity_distance
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.psnr import psnr
@@ -44,6 +45,15 @@ class AlignedFaceEmbedder(Protocol):
 
     def embed(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
         """The embedding of the face in [H, W, 3] uint8 RGB whose five points are [5, 2], pixels."""
+
+
+def open_arcface(file: str, protocol: str, log: Callable[[str], None]) -> ArcFace | None:
+    """ArcFace from its ONNX file; None where none is named; under the paper's protocols the log says so."""
+    if file:
+        return ArcFace(Path(file))
+    if protocol != "ours":
+        log("faces are not compared (FC): evaluate.arcface=FILE names ArcFace's ONNX file")
+    return None
 
 
 @dataclasses.dataclass(frozen=True)

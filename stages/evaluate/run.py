@@ -22,7 +22,6 @@ from pipeline.config.evaluation_protocol import PHOTOGRAPH
 from pipeline.config.settings import as_dict
 from pipeline.detection.mediapipe import FaceFinder
 from pipeline.metrics import Lpips
-from pipeline.metrics.arcface import ArcFace
 from pipeline.metrics.face_identity import FaceRecognizer
 from pipeline.orbit_cameras import orbit, relaxed_pose, visible_extent
 from pipeline.pictures import side_by_side
@@ -37,7 +36,7 @@ from stages.evaluate import STAGE
 from stages.evaluate.baselines import frame_baselines
 from stages.evaluate.evaluated_clip import EvaluatedClip, read_evaluated_clip
 from stages.evaluate.exports import Rig, avatar_rig, write_exports
-from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer
+from stages.evaluate.frame_metrics import AlignedFaceEmbedder, FaceEmbedder, Scorer, open_arcface
 from stages.evaluate.methods import (
     AVATAR,
     REFINED,
@@ -99,8 +98,7 @@ def run(context: Context) -> None:
     """
     settings: EvaluateSettings = context.settings
     start = time.monotonic()
-    photographed = settings.choices.edge_colors == PHOTOGRAPH
-    clip = read_evaluated_clip(context.inputs, context.body_file, photographed)
+    clip = read_evaluated_clip(context.inputs, context.body_file, settings.choices.edge_colors == PHOTOGRAPH)
     avatar = load_avatar(context.inputs["train"] / "avatar.safetensors", clip.body)
     networks = {str(name): Lpips(context.assets["lpips"], name) for name in settings.lpips_networks}
     scorer = Scorer(networks, settings.choices.background, settings.choices.render_mask)
@@ -117,7 +115,7 @@ def run(context: Context) -> None:
         embedder=FaceRecognizer(context.assets["dlib"], context.assets["identity"])
         if settings.identity
         else None,
-        arcface=ArcFace(Path(settings.arcface)) if settings.arcface else None,
+        arcface=open_arcface(settings.arcface, settings.protocol, context.log),
         other_cameras=other_camera_rows(context, clip, animate, mesh),
         surface=seen_surface(avatar),
         rig=rig,
@@ -158,8 +156,7 @@ def other_camera_rows(
         return []
     start = time.monotonic()
     methods: list[AvatarMethod | TexturedMesh] = [AvatarMethod(AVATAR, clip, animate, ())]
-    if mesh is not None:
-        methods.append(mesh)
+    methods += [] if mesh is None else [mesh]
     background = context.settings.choices.background
     rows = list(score_other_cameras(clip, methods, read_true_surface(clip), background))
     context.timing("views_seconds", time.monotonic() - start)

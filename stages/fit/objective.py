@@ -153,6 +153,16 @@ class RegistrationObjective:
             "smooth": settings.smoothness * self._smooth(parameters, predicted, window),
         }
 
+    def values(self, parameters: Parameters) -> dict[str, float]:
+        """The weighted terms of the whole clip as they are at the end of a fit, window by window."""
+        total: dict[str, float] = {}
+        with torch.no_grad():
+            for window in windows(len(self.times), self.settings.minibatch):
+                terms_of = self(parameters.rows(window.low, window.high), True, window)
+                for name, value in terms_of.items():
+                    total[name] = total.get(name, 0.0) + float(value)
+        return total
+
     def residuals(self, parameters: Parameters) -> Tensor:
         """Reprojection errors, [T, N], pixels of the stored frames; NaN where masked."""
         parts = []

@@ -113,6 +113,8 @@ def register(
     if target is not None:
         initial = with_face(initial, target, movable)
         face = FaceTerm(target, landmark_model(body, target.points, betas, spread))
+    if settings.iterations:
+        log(described_start(settings, body, betas, start))
     objective = RegistrationObjective(
         body, observations, model, views, initial, movable, settings, face, torch.from_numpy(paced(times))
     )
@@ -122,6 +124,9 @@ def register(
     fitted = optimise(
         objective, initial, settings.iterations, frozen, settings.learning_rate, settings.minibatch, recorder
     )
+    if settings.iterations:
+        left = ", ".join(f"{name} {value:.3g}" for name, value in objective.values(fitted).items())
+        log(f"objective in the end: {left}")
     identity, poses = _outcome(objective, fitted, spread)
     identity = with_eyeballs(body, identity) if bool(seen[on_face].any()) else identity
     eyes = _fit_eyes(body, landmarks, objective, fitted, identity)
@@ -161,6 +166,14 @@ def registered_faces(settings: FitSettings, target: FaceTarget | None, start: In
         return int(target.valid.sum())
     given = start is not None and start.expression is not None and settings.face != "off"
     return int(start.valid.sum()) if given and start is not None else 0
+
+
+def described_start(settings: FitSettings, body: BodyModel, betas: int, start: InitialPoses | None) -> str:
+    """The line of the log that says where poses start and how many coefficients are fitted."""
+    where = "the poses that were given" if start is not None else "keypoints; fit.pose_init names given poses"
+    count = body.expression_directions.shape[2]
+    fewer = betas < settings.betas or count < settings.expressions
+    return f"fits {betas} betas and {count} expressions{', all that the body has' * fewer}, from {where}"
 
 
 def paced(times: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 BEST_POINTS = 5  # a person is there when this many body points are
 OFF_MASK = "keypoints off the mask"
+NO_BODY = "keypoints without five of the body, among which nose, eyes and ears are"
 OTHER_SHOT, ABSENT = "another shot", "another person"
 NEIGHBOURHOOD = 1.5  # of a person's radius about the hips: what the estimator is shown where others are about
 MOST_COMPARED = 32  # frames whose masks are kept, to tell how given keypoints fail
@@ -134,9 +135,9 @@ class FrameDetector:
             return "no keypoint file"
         people = given.people(picture.index, (self.clip.width, self.clip.height))
         people[..., :2] *= [self.width / self.clip.width, self.height / self.clip.height]
-        people = people[[self._is_somebody(points[BODY]) for points in people]] if len(people) else people
-        if not len(people):
-            return "no person found"
+        if not any(self._is_somebody(points[BODY]) for points in people):
+            return NO_BODY if any(map(self._is_somebody, people)) else "no person found"
+        people = people[[self._is_somebody(points[BODY]) for points in people]]
         masks = self._masks(picture, estimate, own)
         if isinstance(masks, str):
             return masks
@@ -152,7 +153,7 @@ class FrameDetector:
         return FrameDetections(None, points, masks)
 
     def _is_somebody(self, points: np.ndarray) -> bool:
-        """Whether the body's points [N, 3] are scored well enough."""
+        """Whether the best of some points [N, 3] are scored well enough."""
         return float(np.sort(points[:, 2])[-BEST_POINTS:].mean()) >= self.settings.body_score
 
     def _estimate(self, picture: SourceFrame, own: np.ndarray | None) -> Estimate | None:

@@ -69,6 +69,9 @@ def open_sources(context: Context, shot: Shot, layout: str, span: range | None =
         mediapipe = context.assets[MEDIAPIPE]
     if keypoints is not None and mediapipe is not None:
         context.log("keypoints: as given; MediaPipe gives the masks alone")
+    elif mediapipe is not None:
+        found = "keypoints and masks" if masks is None else "keypoints"
+        context.log(f"{found}: MediaPipe's; ingest.keypoints and ingest.masks name another program's")
     return DetectionSources(mediapipe, keypoints, masks, kind, {"keypoints": points_of, "masks": masks_of})
 
 

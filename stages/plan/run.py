@@ -19,6 +19,9 @@ def run(context: Context) -> None:
         inputs = read_inputs(context.inputs["ingest"], context.inputs["fit"], context.body_file)
         plan = decide(inputs, context.settings)
     write_plan(context.output / "plan.json", plan)
+    told = [one.effect.replace("_", " ") for one in plan.decisions if one.forced]
+    if told:
+        context.log(f"set, not decided by the clip: {', '.join(told)}; plan.json says what it calls for")
     numbers = ("gaussians", *COUNTED)  # what they say matters more than that they are on
     for effect in numbers:
         context.log(plan[effect].why)

@@ -68,8 +68,10 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
     started = time.monotonic()
     network = Lpips(context.assets["lpips"], settings.lpips_network) if settings.lpips else None
     trainer = build_trainer(data, settings, device, network, log)
+    captured, made = trainer.data.sources
+    log(f"learns from {len(captured)} captured and {len(made)} generated frames")
     context.timing("prepare_seconds", time.monotonic() - started)
-    log(describe_objective(settings))
+    log(describe_objective(trainer.settings))
     levels = range(len(trainer.avatar.surfaces))
     costs = step_costs(settings, [len(trainer.avatar.surface(level).canonical) for level in levels])
     with context.progress(settings.iterations, "training", costs) as progress:
@@ -79,8 +81,11 @@ def train_subject(context: Context, compiled: CompileTimer) -> None:
         trainer.run()
     for name, value in timer.summary(first, trainer.iteration).items():
         context.timing(name, value)
-    gate = trainer.hooks.get("gate")
-    publish(trainer, curve.curve, gate if isinstance(gate, VisibilityGate) else None, context.output)
+    hook = trainer.hooks.get("gate")
+    gate = hook if isinstance(hook, VisibilityGate) else None
+    if gate is not None:
+        log(f"visibility gate: {gate.described()}; {len(trainer.avatar)} Gaussians are left")
+    publish(trainer, curve.curve, gate, context.output)
 
 
 def log_computing(context: Context, device: torch.device) -> None:
@@ -120,9 +125,8 @@ def build_trainer(
     drawn = frames_to_draw(data, settings.iterations * settings.batch, settings.visits)
     if len(drawn) < len(data.clip.split.train):
         log(f"draws the {len(drawn)} most different of {len(data.clip.split.train)} training frames")
-    scene = read_scene(data.clip, data.crops.box) if settings.scene_share else None
-    if settings.scene_share and scene is None:
-        log("the camera moves: frames are compared over drawn colours alone")
+    scene = read_scene(data.clip, data.crops.box, log) if settings.scene_share else None
+    settings = settings if scene else dataclasses.replace(settings, scene_share=0.0)
     data = dataclasses.replace(data, drawn=drawn, scene=scene)
     refinement = PoseRefinement(moved(data.poses, device), data.clip.split.train)
     avatar, data = initial_avatar(data, refinement, settings, log)

@@ -9,7 +9,7 @@ moving camera are compared over drawn colours alone.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from pipeline.clip.background import learn_background
 from pipeline.clip.boxes import Box
 from pipeline.clip.camera import Camera
 from pipeline.clip.fitted_clip import FittedClip
+
+_INSTEAD = ": train.scene_share does nothing, and frames are compared over drawn colours alone"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,16 +40,20 @@ class BackgroundPlate:
         return BackgroundPlate(self.color.to(device), self.confidence.to(device))
 
 
-def read_scene(clip: FittedClip, box: Box | None) -> BackgroundPlate | None:
-    """The scene in a box of the training frames; None where the camera moves.
+def read_scene(
+    clip: FittedClip, box: Box | None, log: Callable[[str], None] = lambda line: None
+) -> BackgroundPlate | None:
+    """The scene in a box of the training frames; None where the camera moves, or no pixel of it is known.
 
     Args:
         clip: the frames.
         box: that training crops from each; None for whole frames.
+        log: for a line on how much of it is known, or why it is none.
     """
     frames = clip.split.train
     cameras = [clip.camera(frame) for frame in frames]
     if not all(_same(camera, cameras[0]) for camera in cameras):
+        log(f"no scene, for the camera moves{_INSTEAD}")
         return None
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -55,10 +61,13 @@ def read_scene(clip: FittedClip, box: Box | None) -> BackgroundPlate | None:
             yield clip.frame(frame), clip.mask(frame).astype(np.float32) / 255
 
     found = learn_background(pairs())
-    if found is None:
-        return None
+    assert found is not None  # there are training frames
     rows = (slice(None), slice(None)) if box is None else box.slices
     color, confidence = found.mean[rows] / 255, found.confidence[rows]
+    if not confidence.any():
+        log(f"no scene, for too few frames show what is behind the person{_INSTEAD}")
+        return None
+    log(f"scene: {confidence.mean():.0%} of the crop is known behind the person")
     return BackgroundPlate(torch.from_numpy(color.copy()), torch.from_numpy(confidence.copy()))
 
 

@@ -129,6 +129,11 @@ class VisibilityGate(nn.Module, Hook):
         """The last threshold that was found; None before the warm-up has ended."""
         return self._last_threshold()[0] if bool(self.drawn_at_threshold.any()) else None
 
+    def described(self) -> str:
+        """The last threshold in words, or why there is none."""
+        found = self.threshold
+        return found.why if found else "no look fell within the run, see train.gate_from and train.gate_every"
+
     def update(self) -> Threshold:
         """Finds the threshold and gates what lies below it."""
         self.hits_at_threshold.copy_(self.hits)

@@ -14,7 +14,7 @@ from pipeline.body import BodyModel, Identity, Poses, pose_body, rest_joints
 from pipeline.clip.camera import Camera
 from stages.ingest.mannequin.footage import Filming
 from stages.ingest.mannequin.scene import film, make_background
-from stages.ingest.mannequin.spec import MannequinSpec
+from stages.ingest.mannequin.spec import Framing, MannequinSpec
 from tests.made.body import open_body, open_landmarks
 
 SIZE, COUNT, FEW = 112, 6, 3
@@ -76,13 +76,15 @@ class Footage:
         return Rotation.from_rotvec(self.poses.rotation[:, 0].double().numpy()).as_matrix()
 
 
+MOTIONS: dict[Framing, str] = {"full": "turn+gesture+curl+speech", "head": "nod+speech"}
+
+
 @functools.cache
-def footage() -> Footage:
+def footage(framing: Framing = "full") -> Footage:
     """Film it; all tests share what comes out."""
     body = open_body()
-    spec = MannequinSpec(
-        "full", motion="turn+gesture+curl+speech", frames=COUNT, size=SIZE, fps=8.0, noise=0.0
-    )
+    motion = MOTIONS[framing]
+    spec = MannequinSpec(framing, motion=motion, frames=COUNT, size=SIZE, fps=8.0, noise=0.0)
     filming = Filming(spec, body, open_landmarks())
     points = filming.places.world[:, filming.places.sets["whole_body"]].double().numpy()
     first = filming.scene.shot.camera

@@ -107,6 +107,15 @@ def test_a_clip_that_cannot_be_made_stops_what_needs_it(toy):
     assert run.returncode != 0 and "gone.txt" in run.stderr + run.stdout and "Traceback" not in run.stderr
 
 
+def test_nothing_is_made_for_a_clip_that_cannot_be_used(toy):
+    clip = toy.root / "noise.txt"
+    clip.write_bytes(b"\xff\xfe")
+    assert toy.doit("sing", "subject=ann", f"tune=clip:{clip}").returncode != 0
+    assert toy.ran() == ["gather:noise"]
+    assert toy.doit("sing", "paint:ann", "subject=ann", f"tune=clip:{clip}").returncode != 0
+    assert sorted(toy.ran()) == ["bend:ann", "gather:ann", "gather:noise", "paint:ann"]
+
+
 def test_clean_takes_its_results_too(toy):
     toy.doit("sing", "subject=ann")
     assert toy.doit("subject=ann", command="clean").returncode == 0

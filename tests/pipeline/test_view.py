@@ -18,6 +18,7 @@ from pipeline.avatar import save_avatar
 from pipeline.avatar.storage import PREVIEW, save_preview
 from pipeline.config.workspace import REPOSITORY, open_workspace
 from pipeline.errors import UserError
+from pipeline.store.artifact import SCRATCH, lock_of
 from pipeline.viewer.page import viewer_page
 from pipeline.viewer.server import LiveAvatar, ViewServer
 from pipeline.viewer.shown import novel_motion, packed_avatar
@@ -104,13 +105,24 @@ def test_it_follows_a_training_and_keeps_the_last_that_could_be_read(workspace, 
         assert state["stamp"] == first and state["said"] and get(f"{server.url}avatar") == shown
         save_preview(work, an_avatar(body, "bases", awake=False))
         state = json.loads(get(f"{server.url}state"))
-        assert state["stamp"] != first and "checkpoint" in state["said"]
+        assert state["stamp"] != first and "broken off" in state["said"]
+        with lock_of(work.parents[1] / work.parent.name.removeprefix(SCRATCH)):
+            assert "that runs" in json.loads(get(f"{server.url}state"))["said"]
         assert get(f"{server.url}avatar") != shown
         shutil.rmtree(work.parent)  # published, or given up
         assert json.loads(get(f"{server.url}state"))["stamp"] == first
 
 
 def test_where_there_is_no_avatar_it_says_how_to_make_one(workspace):
+    with pytest.raises(UserError, match="doit run subject=bob"):
+        LiveAvatar(AvatarSource(workspace, "bob"))
+
+
+def test_a_training_without_a_checkpoint_is_waited_for(workspace):
+    work = training_leaves(workspace, "bob")
+    with lock_of(work.parents[1] / work.parent.name.removeprefix(SCRATCH)):
+        with pytest.raises(UserError, match="checkpoint_every"):
+            LiveAvatar(AvatarSource(workspace, "bob"))
     with pytest.raises(UserError, match="doit run subject=bob"):
         LiveAvatar(AvatarSource(workspace, "bob"))
 

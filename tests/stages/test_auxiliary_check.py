@@ -61,6 +61,7 @@ def judged(clip, settings, assets_folder, tmp_path):
         context = context_for(clip, tmp_path / "out", assets, **changes)
         stage.run(context)
         counts = json.loads((context.output / "auxiliary.json").read_text())
+        assert counts["kept"] or "auxiliary.check=false" in context.logged[-1]
         frames = [int(path.stem) % 100_000 for path in sorted((context.output / "frames").iterdir())]
         return frames, counts["refused"], counts["identity_distance"]
 

@@ -242,6 +242,8 @@ def test_fit_face_says_what_it_did(model, face, clip):
     keypoints = keypoints_of(clip, face.rows.numpy())
     found, said = fitted(model, keypoints, clip.views, FitSettings(face="mesh"))
     assert found.source == "mesh" and len(said) == 1 and "(mesh): fitted in" in said[0]
+    _, said = fitted(model, keypoints, clip.views, FitSettings(flame_fit=True))  # as in the paper preset
+    assert "fit.flame_model" in said[0] and "(mesh): fitted in" in said[1]
     found, said = fitted(model, keypoints, clip.views, FitSettings(face="off"))
     assert found is None and said == ["face first: switched off"]
     keypoints.face_mesh[..., 3] = 0.1
@@ -261,6 +263,7 @@ def test_the_68_points_of_the_133_serve_where_there_is_no_mesh(model):
     keypoints.whole_body[20, FACE, 2] = 0.1
     found, said = fitted(model, keypoints, clip.views, FitSettings())
     assert found.source == "points" and "(points): fitted in 39 of 40" in said[0]
+    assert "ingest.keypoints=mediapipe" in said[0] and len(said) == 1
     assert not found.valid[20]
     turned = roma.rotmat_geodesic_distance(found.orientation, clip.orientation)[found.valid]
     assert turned.median() < 0.06 and turned.max() < 0.2

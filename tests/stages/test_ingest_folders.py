@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from pipeline.clip.frames import read_frame, read_mask
-from pipeline.clip.keypoints import NAMES, read_keypoints
+from pipeline.clip.keypoints import FACE, NAMES, read_keypoints
 from pipeline.clip.records import Split, read_cameras, read_footage, read_split
 from pipeline.errors import UserError
+from stages.ingest.detect import NO_BODY
 from stages.ingest.run import run
 from tests.made.videos import (
     body_points,
@@ -115,6 +116,16 @@ def test_dropped_frames_are_told(material: Path, capsys: pytest.CaptureFixture[s
     write_points(material / "keypoints", (2, 3), score=0.05)
     ingest(material)
     assert "8 of 10 frames of 128x96 kept, 1 of them held out (no person found: 2)" in capsys.readouterr().out
+
+
+def test_points_of_the_face_alone_are_told_apart_from_nobody(material: Path) -> None:
+    for number in (2, 3):
+        points = np.array(body_points(40, 44))
+        points[:, 2] = 0.0
+        if number == 3:
+            points[FACE, 2] = 1.0
+        (material / "keypoints" / f"{number}.json").write_text(json.dumps(points.tolist()))
+    assert read_footage(ingest(material) / "footage.json").dropped == {NO_BODY: 1, "no person found": 1}
 
 
 def test_points_outside_the_picture_lose_their_score(material: Path) -> None:

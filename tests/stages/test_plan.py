@@ -145,6 +145,15 @@ def test_equal_inputs_give_equal_bytes(clip):
     assert (clip / "out" / "plan.json").read_bytes() == first
 
 
+def test_what_is_set_and_not_decided_is_named_in_the_log(clip):
+    def naming(**settings):
+        context = context_of(clip, **settings)
+        run(context)
+        return [line for line in context.logged if "face loss" in line and "plan.json" in line]
+
+    assert len(naming(face_loss="on")) == 1 and not naming()
+
+
 @pytest.mark.parametrize("effect", [*DECIDED, *SEEN_PARTS])
 def test_any_decision_is_overridden_from_the_command_line(inputs, usual, effect):
     choice = "off" if usual.on(effect) else "on"

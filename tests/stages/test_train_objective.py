@@ -214,8 +214,9 @@ def test_term_that_lacks_what_it_needs_is_refused(objective):
 
 def test_the_whole_frame_is_compared_over_the_clips_own_background(subject, tmp_path):
     made = scene(subject, tmp_path / "scene", gate=False)
-    clip, box = made.data.clip, made.data.crops.box
-    behind = read_scene(clip, box)
+    clip, box, said = made.data.clip, made.data.crops.box, []
+    behind = read_scene(clip, box, said.append)
+    assert "%" in said.pop()
     view = made.data.view(0)
     assert behind.color.shape == view.color.shape and behind.confidence.shape == view.alpha.shape
     known = (behind.confidence > 0) & (view.alpha == 0)
@@ -229,4 +230,7 @@ def test_the_whole_frame_is_compared_over_the_clips_own_background(subject, tmp_
     assert not {"l1_scene"} & set(over.objective(scene_share=0.25, generated=(0, 1, 2, 3, 4))(0, 0, False))
     moved = dict(clip.cameras)
     moved[1] = dataclasses.replace(moved[1], translation=moved[1].translation + 0.1)
-    assert read_scene(dataclasses.replace(clip, cameras=moved), box) is None
+    few = Split(clip.split.train[:2], clip.split.test)
+    for changed in ({"cameras": moved}, {"split": few}):  # of two frames nothing is known behind the person
+        assert read_scene(dataclasses.replace(clip, **changed), box, said.append) is None
+        assert "train.scene_share does nothing" in said.pop() and not said

@@ -50,7 +50,9 @@ def test_warm_up_ends_when_it_should_and_what_is_gated_is_gone(trainer):
     for _ in range(2):
         trainer.step()
     assert trainer.hooks["gate"].threshold is None and len(trainer.avatar) == body
+    assert "train.gate_every" in trainer.hooks["gate"].described()
     trainer.step()
+    assert trainer.hooks["gate"].described() == trainer.hooks["gate"].threshold.why
     assert trainer.hooks["gate"].threshold.closed and len(trainer.avatar) < 0.6 * body
     decoded = trainer.avatar.decode(0)
     assert len(decoded.offset) == len(trainer.avatar) == int(trainer.avatar.active.sum())

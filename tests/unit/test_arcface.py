@@ -9,6 +9,7 @@ import pytest
 from pipeline.errors import UserError
 from pipeline.metrics.arcface import TEMPLATE, ArcFace, aligned, five_points, similarity
 from pipeline.metrics.face_identity import identity_cosine
+from stages.evaluate.frame_metrics import open_arcface
 from tests.made.onnx_models import pooled_model
 
 WEIGHTS = np.random.default_rng(0).standard_normal((48, 512)).astype(np.float32)
@@ -39,6 +40,16 @@ def test_the_embedding_is_the_models(tmp_path, normalises, batch):
     found = ArcFace(write(tmp_path, model)).embed(picture(), TEMPLATE)
     assert found.shape == (512,)
     np.testing.assert_allclose(found, expected(picture()), atol=2e-3)  # a face in its place is not touched
+
+
+def test_without_a_file_the_papers_protocols_say_what_is_missing(tmp_path):
+    said: list[str] = []
+    assert open_arcface("", "ours", said.append) is None and not said
+    assert open_arcface("", "paper_black", said.append) is None and "evaluate.arcface" in said.pop()
+    file = write(tmp_path, pooled_model(WEIGHTS))
+    assert isinstance(open_arcface(str(file), "paper", said.append), ArcFace) and not said
+    with pytest.raises(UserError, match="evaluate.arcface"):
+        open_arcface(str(tmp_path / "none.onnx"), "paper", said.append)
 
 
 def test_a_face_is_known_wherever_it_is(tmp_path):

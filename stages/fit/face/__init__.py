@@ -26,6 +26,7 @@ from stages.fit.settings import FitSettings
 __all__ = ["FaceTarget", "fit_face", "sface"]
 
 _MESH_POINTS, _FACE_POINTS = 478, 68
+_NO_MESH = "; the keypoints hold no mesh of 478 points, which ingest.keypoints=mediapipe finds"
 _SHAPES, _EXPRESSIONS = 100, 50  # DECA's, and the paper's, where DECA gives no start
 
 
@@ -58,6 +59,8 @@ def fit_face(
     if settings.face == "off":
         log("face first: switched off")
         return None
+    if settings.flame_fit and settings.face != "flame":
+        log("face first: without FLAME, for no file of it is named: fit.face=flame fit.flame_model=FILE")
     with threads(1), torch.no_grad():
         flat = settings.face != "flame" and int(observations.of("face").sum()) == _FACE_POINTS
         model = face_model(body, landmarks.whole_body[FACE] if flat else landmarks.face_mesh)
@@ -80,7 +83,7 @@ def fit_face(
     log(
         f"face first ({target.source}): fitted in {int(target.valid.sum())} of {len(target.valid)} frames, "
         f"{len(target.rows)} points, {1000 * float((target.neutral - mean).norm(dim=1).mean()):.1f} mm "
-        "from the mean face"
+        f"from the mean face{_NO_MESH if flat else ''}"
     )
     return target
 
