@@ -14,7 +14,7 @@ import dataclasses
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from pipeline.avatar import Avatar
 from pipeline.body import Pose, load_body, load_landmarks
 from pipeline.clip.camera import Camera
 from pipeline.clip.composite import composite_frame
+from pipeline.clip.fit_quality import FitQuality
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.clip.foreground import FOREGROUND
 from pipeline.clip.frames import write_frame, write_mask, write_png
@@ -173,7 +174,14 @@ def fitted(job: Job, fit: str) -> FittedClip:
     folder, body = frame.made(job, "ingest")["ingest"].folder, load_body(job.workspace.body_file)
     truth = read_truth(folder, body)
     cameras = dict.fromkeys(truth.poses.frames, scene_of(job).shot.camera)
-    return FittedClip(folder, read_split(folder / "split.json"), cameras, body, truth.surface, truth.poses)
+    split, poses = read_split(folder / "split.json"), truth.poses
+    return FittedClip(folder, split, cameras, body, truth.surface, poses, exact(poses.frames))
+
+
+def exact(frames: Sequence[int]) -> FitQuality:
+    """The quality of a fit that is the truth."""
+    ones, zeros = np.ones(len(frames)), np.zeros(len(frames))
+    return FitQuality(np.asarray(frames, np.int64), ones, ones, zeros, ones, zeros, ones > 0)
 
 
 def contestants(

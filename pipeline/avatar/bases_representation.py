@@ -143,8 +143,8 @@ class BasesRepresentation(Representation):
     @torch.no_grad()
     def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
         """Takes the values as its own parameters: True."""
-        # What is fully trusted stays as it is, to the byte.
-        some = (share < 1).any(1)
+        # What is fully trusted, and has its size, stays as it is, to the byte.
+        some = (share < 1).any(1) | (completed.log_scale != self.log_scale[rows]).any(1)
         chosen = rows[some]
         self.offset[chosen] = completed.offset[some] / self._offset_unit
         self.log_scale[chosen] = completed.log_scale[some]

@@ -18,12 +18,18 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.avatar import Avatar
+from pipeline.avatar.canonical import dilate
 from pipeline.avatar.evidence import Evidence, covering_log_scale
+from pipeline.avatar.holes import around_holes
 from pipeline.avatar.representation import Decoded
 from pipeline.avatar.surface import Surface
+from pipeline.body import Pose
+from pipeline.orbit_cameras import relaxed_pose
 from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import Segments, find_segments
 
+ARMS = 1.0  # radians that they hang down while holes are looked for
+FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
 
@@ -54,27 +60,44 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
     avatar.trust.index_copy_(0, rows, evidence.together.to(avatar.trust))
     if bool((evidence.together == 1).all()):
         return
+    segments = surface_segments(decoded.surface)
+    colored = with_completed_colors(decoded, segments, evidence)
+    avatar.take_completion(rows, closed(avatar, colored, segments, evidence))
+
+
+def closed(avatar: Avatar, decoded: Decoded, segments: Segments, evidence: Evidence) -> Decoded:
+    """What was decoded with scales completed, and those about holes that are left no smaller than covers.
+
+    Frames that show a surface from its edge alone let it become a sieve, which shows from its side.
+    """
     covers = covering_log_scale(avatar.architecture.scale)
-    avatar.take_completion(rows, completed_values(decoded, evidence, covers))
+    completed = with_completed_scales(decoded, segments, evidence.shape_trust, covers)
+    mesh, still = decoded.surface.canonical, torch.zeros(3, device=avatar.device)
+    expression = still.new_zeros(mesh.expression_directions.shape[-1])
+    pose = Pose(relaxed_pose(ARMS).to(still), expression, still)
+    sieve = dilate(around_holes(avatar.pose(completed, pose).gaussians, mesh.faces), mesh.faces, rings=1)
+    larger = torch.maximum(completed.log_scale, still.new_tensor([covers, covers, FLAT]))
+    log_scale = torch.where(sieve[:, None], larger, completed.log_scale)
+    return dataclasses.replace(completed, log_scale=log_scale)
 
 
-def completed_values(decoded: Decoded, evidence: Evidence, covers: float) -> Decoded:
-    """What was decoded with colour and scale completed, the latter by ``covers``, a log scale.
+def with_completed_scales(decoded: Decoded, segments: Segments, trust: Tensor, covers: float) -> Decoded:
+    """What was decoded with scales completed by ``covers``, a log scale, where trust, [N], is weak."""
+    scales = complete_log_scales(segments, *_arrays(decoded.log_scale, trust), (covers, covers, FLAT))
+    return dataclasses.replace(decoded, log_scale=torch.from_numpy(scales).to(decoded.log_scale))
+
+
+def with_completed_colors(decoded: Decoded, segments: Segments, evidence: Evidence) -> Decoded:
+    """What was decoded with colours completed.
 
     Offsets stay: what no frame shows must keep behind the silhouettes that frames do show, and training has
     put it there.
     """
-    segments, like = surface_segments(decoded.surface), decoded.offset
     told = _arrays(torch.sigmoid(decoded.color_logit), *_of_color(evidence))
-    log_scale, shape_trust = _arrays(decoded.log_scale, evidence.shape_trust)
     found = torch.from_numpy(complete_colors(segments, *told))
-    logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(like)
-    scales = complete_log_scales(segments, log_scale, shape_trust, covers)
-    return dataclasses.replace(
-        decoded,
-        color_logit=torch.where((evidence.trust == 1)[:, None], decoded.color_logit, logits),
-        log_scale=torch.from_numpy(scales).to(like),
-    )
+    logits = torch.logit(found.clamp(DARKEST, BRIGHTEST)).to(decoded.color_logit)
+    known = (evidence.trust == 1)[:, None]
+    return dataclasses.replace(decoded, color_logit=torch.where(known, decoded.color_logit, logits))
 
 
 def _of_color(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:

@@ -5,14 +5,16 @@ right for the gate, and wrong for every question about colours and places: a bac
 whole clip is in every picture. Here a frame counts for a Gaussian by
 
 - its *share*: the blending weight that the Gaussian has in the person's own pixels, against the pixels that
-  its piece of the surface would cover if nothing stood before it. The share does not depend on the picture's
-  resolution, nor on how finely the mesh is divided there;
+  its piece of the surface would cover if nothing stood before it, both together with those of its neighbours
+  (``pooled``): training leaves some a hair behind those beside them, which show the same surface. The share
+  does not depend on the picture's resolution, nor on how finely the mesh is divided there;
 - its *squareness*: the cosine between the surface's normal and the view. Under ``GRAZING`` a frame says
   nothing, because a fit that is a little off shows the wall there.
 
 Evidence is asked of Gaussians that are large enough to cover (``covering``): one that has shrunk because it
-lies outside the mask would otherwise count as hidden, and be made whole. So no training frame changes when
-what evidence does not reach is completed. What looks at evidence asks for ``trust``, ``shape_trust`` or
+lies outside the mask would otherwise count as hidden, and be made whole. What shows between others because
+those have shrunk keeps its colour, too (``with_colors_of``). So hardly a pixel of a training frame changes
+when what evidence does not reach is completed. What looks at evidence asks for ``trust``, ``shape_trust`` or
 ``source``, which are continuous.
 """
 
@@ -41,6 +43,8 @@ KEPT = 0.005, 0.04  # mean share: nothing, and all, of what was learnt is kept; 
 TELLS = 0.01, 0.12  # likewise, of what others are told by: one frame in eight
 EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
 COVERING = 0.75  # standard deviations in distances to the neighbours; 0.55 lets a tenth through between four
+RINGS = 1  # of neighbours that a share is taken of together
+BORROWED = 1e-3  # of the neighbours' sum, some 40 times what is a Gaussian's own, that its colour is told by
 SMALLEST = 1e-3  # pixels that a piece of surface covers, under which a frame says nothing of it
 
 
@@ -95,6 +99,15 @@ class Evidence:
             facing=torch.maximum(self.facing, other.facing),
             color=share * self.color + (1 - share) * other.color,
             normals=self.normals,
+        )
+
+    def with_colors_of(self, other: Evidence) -> Evidence:
+        """This evidence, trusting also the colours that the other shows, as of the avatar as it is."""
+        better = (other.frames > self.frames)[:, None]
+        return dataclasses.replace(
+            self,
+            frames=torch.maximum(self.frames, other.frames),
+            color=torch.where(better, other.color, self.color),
         )
 
 
@@ -166,13 +179,27 @@ def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Ten
     if view.trust is not None:
         counts = counts * (view.trust >= LEAST_TRUST)[..., None]
     color = torch.autograd.grad((image * view.color * counts).sum(), weighed.colors, retain_graph=True)[0]
-    weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, 0]
-    covered = covered.clamp_min(SMALLEST)
-    showed = ramp(weight / covered, HIDDEN, OPEN)
-    shape = ramp(rendering.weights.to(weight) / covered, *PROTRUDES)
+    weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, :1]
+    own = torch.cat([weight, rendering.weights.to(weight)[:, None], covered[:, None], color], 1)
+    around = pooled(own, faces)
+    share = around[:, :2] / around[:, 2:3].clamp_min(SMALLEST)
+    showed, shape = ramp(share[:, 0], HIDDEN, OPEN), ramp(share[:, 1], *PROTRUDES)
     seen = showed * ramp(cosine, GRAZING, SQUARE)
-    mean = color / weight.clamp_min(1e-12)[:, None]
+    # What has no weight of its own has the colour of what is around it.
+    told = own + BORROWED * around
+    mean = told[:, 3:] / told[:, :1].clamp_min(1e-12)
     return seen, showed, shape, showed * cosine, mean * showed[:, None], normals
+
+
+def pooled(
+    values: Tensor,  # [N, C]
+    faces: Tensor,  # [F, 3]
+) -> Tensor:
+    """Sums over each point and those within ``RINGS`` triangles, nearer ones oftener, [N, C]."""
+    for _ in range(RINGS):
+        around = values[faces].sum(1).repeat_interleave(3, 0)
+        values = torch.zeros_like(values).index_add_(0, faces.flatten(), around)
+    return values
 
 
 def covered_pixels(

@@ -17,6 +17,8 @@ Everything blends continuously by trust: 1 keeps a vertex as it is, 0 takes the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.sparse as sparse
 
@@ -72,10 +74,11 @@ def complete_log_scales(
     segments: Segments,
     log_scale: np.ndarray,  # [N, C]
     trust: np.ndarray,  # [N]
-    covers: float = 0.0,
+    covers: float | Sequence[float] = 0.0,
 ) -> np.ndarray:
-    """A log scale for every vertex, [N, C] float64: ``covers`` where nothing is known."""
-    return completed(segments, log_scale, np.full_like(log_scale, covers), trust, trust)
+    """A log scale for every vertex, [N, C] float64: ``covers``, one or C of them, where nothing is known."""
+    guessed = np.broadcast_to(np.asarray(covers, log_scale.dtype), log_scale.shape)
+    return completed(segments, log_scale, guessed, trust, trust)
 
 
 def completed(

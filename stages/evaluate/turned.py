@@ -13,12 +13,12 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar
+from pipeline.avatar.holes import CLOSED, inner_silhouette
 from pipeline.avatar.sparse import SparsePair
 from pipeline.body import rasterize
 from pipeline.clip.camera import Camera
@@ -28,8 +28,6 @@ from stages.evaluate.report.pictures import on_grey
 
 ANGLES = 8
 WIDTH, HEIGHT = 240, 320  # pixels
-CLOSED = 0.95  # alpha from which a pixel is no hole
-SHRUNK = 2  # pixels by which the silhouette is made smaller
 SURE = 0.5  # trust from which a Gaussian counts as seen
 GUESSED = (0.95, 0.35, 0.10)  # the colour that marks what was guessed
 BEHIND = 4  # of the eight angles: straight from behind; from 135 degrees the profile of a true face is seen
@@ -122,8 +120,7 @@ def silhouette(camera: Camera, gaussians: Gaussians, surface: SeenSurface) -> np
 
 def hole_share(alpha: np.ndarray, covered: np.ndarray) -> float:
     """The share of a silhouette, made smaller, where alpha is under ``CLOSED``; 0 where nothing is left."""
-    kernel = np.ones((2 * SHRUNK + 1,) * 2, np.uint8)
-    inner = cv2.erode(covered.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    inner = inner_silhouette(covered)
     return float((alpha[inner] < CLOSED).mean()) if inner.any() else 0.0
 
 

@@ -5,7 +5,7 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=7,
+    version=8,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={

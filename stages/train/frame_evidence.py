@@ -25,6 +25,7 @@ def evidence_of(
     data: TrainingData,
     captured: tuple[int, ...],
     made: tuple[int, ...] = (),
+    cover: bool = True,
 ) -> Evidence:
     """The evidence of an avatar's ungated Gaussians, in the poses as they now are.
 
@@ -34,9 +35,10 @@ def evidence_of(
         data: the frames.
         captured: frame numbers, at least one.
         made: generated frames; they are asked for what no captured frame shows.
+        cover: of Gaussians that are all large enough to cover, else of the avatar as it is.
     """
     with torch.no_grad():
-        decoded = covering(avatar.decode())
+        decoded = covering(avatar.decode()) if cover else avatar.decode()
 
     def shown(frames: tuple[int, ...]) -> Iterator[tuple[Gaussians, View]]:
         for frame in frames:
@@ -65,6 +67,10 @@ def settle_unseen(
     """
     captured, made = (spread_from_start(frames, settings.color_frames) for frames in data.sources)
     evidence = evidence_of(avatar, poses, data, captured, made)
+    # What shows between others does so in most frames: half of them tell.
+    evidence = evidence.with_colors_of(
+        evidence_of(avatar, poses, data, captured[::2], made[::2], cover=False)
+    )
     rows = avatar.surface().pick(torch.arange(len(avatar.trust), device=avatar.device))
     avatar.trust.index_copy_(0, rows, evidence.together)
     avatar.representation.forget_unseen(avatar.trust.amax(1) > 0)

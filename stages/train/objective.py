@@ -250,7 +250,7 @@ class TrainingObjective:
             level: of subdivision.
             poses_move: the refined poses are used, so that gradients reach them.
         """
-        decoded, batch = self.avatar.decode(level), self.settings.batch
+        decoded, batch = self._decode(level), self.settings.batch
         total: Terms = {}
         for position in range(iteration * batch, (iteration + 1) * batch):
             frame = self._render(decoded, self.draw(position), level, poses_move)
@@ -267,6 +267,19 @@ class TrainingObjective:
         seconds = self.data.clip.seconds
         drawn = schedule.make_draw(self.settings, self.data.sources, seconds, noise, position)
         return moved(drawn, self.avatar.device)
+
+    def _decode(self, level: int) -> Decoded:
+        """The static avatar; pictures do not teach the colours of Gaussians that no frame shows.
+
+        A little light passes between Gaussians, and what lies behind them, the back of a head, would learn
+        the face in front.
+        """
+        decoded = self.avatar.decode(level)
+        if self.settings.unseen == "generated":  # as training leaves it
+            return decoded
+        shown = decoded.surface.pick(self.avatar.trust)[:, :1] > 0
+        logits = decoded.color_logit
+        return dataclasses.replace(decoded, color_logit=torch.where(shown, logits, logits.detach()))
 
     def _render(self, decoded: Decoded, draw: Draw, level: int, poses_move: bool) -> RenderedFrame:
         """A drawn frame beside its rendering."""

@@ -32,7 +32,7 @@ def publish(trainer: Trainer, curve: Curve, gate: VisibilityGate | None, output:
         output: the folder.
     """
     avatar, clip = trainer.avatar, trainer.data.clip
-    settle_unseen(avatar, trainer.poses, trainer.data, trainer.settings)
+    evidence = settle_unseen(avatar, trainer.poses, trainer.data, trainer.settings)
     avatar.unseen = "base" if trainer.settings.unseen == "base" else "nothing"
     if avatar.unseen == "base":
         color_unseen(avatar)
@@ -40,9 +40,9 @@ def publish(trainer: Trainer, curve: Curve, gate: VisibilityGate | None, output:
     write_poses(output / "poses.parquet", trainer.poses.refined(clip.poses.frames))
     curve.write(output / "curve.parquet")
     if gate is None:
-        write_ungated(output, len(clip.body.v_template))
+        write_ungated(output, len(clip.body.v_template), evidence)
     else:
-        scores, kept = gate.write(output)
+        scores, kept = gate.write(output, evidence)
         write_png(output / "visibility.png", score_picture(clip.body, avatar.identity, scores, kept))
 
 

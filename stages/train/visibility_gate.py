@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.evidence import Evidence
 from pipeline.avatar.otsu_threshold import Threshold, evidence_threshold, fixed_threshold, plain_threshold
 from pipeline.avatar.visibility import body_in_frame
 from pipeline.body import Pose
@@ -160,8 +161,12 @@ class VisibilityGate(nn.Module, Hook):
             return fixed_threshold(scores, fixed)
         return plain_threshold(scores) if self._settings.gate_rule == "otsu" else evidence_threshold(scores)
 
-    def write(self, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    def write(self, folder: Path, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
         """Writes ``visibility.parquet``, a row a body vertex, and ``gate.json``, the threshold.
+
+        Args:
+            folder: for the two files.
+            evidence: of the finished avatar; the gate does not go by it, its record tells it.
 
         Returns:
             The scores of the whole body, the higher of captured and generated, and what is kept; [V] each.
@@ -178,6 +183,7 @@ class VisibilityGate(nn.Module, Hook):
         content = dataclasses.asdict(threshold) | {
             "definition": DEFINITION,
             "drawn": {"captured": int(self.drawn[CAPTURED]), "generated": int(self.drawn[GENERATED])},
+            "evidence": trusted_shares(evidence),
         }
         write_json(folder / "gate.json", content)
         return self.whole_body(torch.maximum(captured, generated)), self.whole_body(self.avatar.active) == 1
@@ -199,13 +205,20 @@ def ever_in_frame(avatar: Avatar, poses: PoseRefinement, views: ViewCache, frame
     return seen
 
 
-def write_ungated(folder: Path, vertices: int) -> None:
+def trusted_shares(evidence: Evidence) -> dict[str, float]:
+    """The mean trust in colour and shape of the avatar's Gaussians, for gate.json."""
+    return {"color": float(evidence.trust.mean()), "shape": float(evidence.shape_trust.mean())}
+
+
+def write_ungated(folder: Path, vertices: int, evidence: Evidence) -> None:
     """Writes what ``VisibilityGate.write`` would, for a run without a gate."""
     nothing, everything = np.zeros(vertices), np.ones(vertices, bool)
     columns = {"captured": nothing, "generated": nothing, "early": ~everything, "kept": everything}
     write_visibility(folder / "visibility.parquet", **columns)
     content = dataclasses.asdict(Threshold(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, "the gate was off"))
-    write_json(folder / "gate.json", content | {"definition": None, "drawn": {"captured": 0, "generated": 0}})
+    drawn = {"captured": 0, "generated": 0}
+    record = {"definition": None, "drawn": drawn, "evidence": trusted_shares(evidence)}
+    write_json(folder / "gate.json", content | record)
 
 
 def write_visibility(path: Path, **columns: np.ndarray) -> None:

@@ -1,5 +1,6 @@
 """Completion: what no frame showed is taken from what frames did, hair from hair and cloth from cloth."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.bake import bake
 from pipeline.avatar.completion import complete_avatar
 from pipeline.avatar.evidence import Evidence, covering_log_scale
+from pipeline.avatar.holes import around_holes
 from pipeline.body import Pose, load_body, mean_identity, part_labels, rest_joints
+from pipeline.orbit_cameras import relaxed_pose
 from pipeline.texture.completion import complete_colors, complete_log_scales
 from pipeline.texture.segments import BODY, FACE, LEFT_HAND, NECK, RIGHT_HAND, SCALP, find_segments
 
@@ -150,6 +153,19 @@ def trained(representation: str) -> Avatar:
     return avatar.eval()
 
 
+def seen_from_behind_only(segments):
+    return np.clip(-4 * segments.normals[:, 2], 0, 1)
+
+
+def test_a_body_seen_from_behind_alone_has_a_face_of_skin_and_cloth_in_front(segments):
+    color, trust = painted(segments), seen_from_behind_only(segments)
+    found = complete_colors(segments, spoiled(color, trust), trust, segments.normals)
+    before = segments.normals[:, 2] > 0.7
+    for label, like, other in ((FACE, SKIN, HAIR), (BODY, CLOTH, SKIN)):
+        guessed = found[before & segments.is_in(label)].mean(0)
+        assert np.abs(guessed - like).max() < np.abs(guessed - other).max() / 2
+
+
 def evidence(trust: torch.Tensor) -> Evidence:
     """Evidence of which trust is 0 or 1, as given."""
     count = len(trust)
@@ -193,3 +209,25 @@ def test_what_was_not_seen_does_not_follow_the_pose(representation):
         colors = [avatar.gaussians(pose).colors for pose in poses]
     torch.testing.assert_close(colors[0][unseen], colors[1][unseen], atol=1e-6, rtol=0)
     assert not torch.allclose(colors[0][~unseen], colors[1][~unseen], atol=1e-4)
+
+
+@pytest.mark.parametrize("representation", ["bases", "triplane"])
+def test_a_sieve_is_closed_though_it_was_seen(representation):
+    avatar = trained(representation)
+    decoded = avatar.decode()
+    chest = (decoded.surface.canonical.parts == 0) & (decoded.surface.canonical.frames[:, 2, 2] > 0)
+    shrunk = decoded.log_scale.clone().clamp_min(0)
+    shrunk[chest] = -2.0
+    everything = torch.arange(len(avatar.trust))
+    avatar.trust[:] = 0.999
+    avatar.take_completion(everything, dataclasses.replace(decoded, log_scale=shrunk))
+    pose = Pose(relaxed_pose(1.0), torch.zeros(10), torch.zeros(3))
+
+    def sieve() -> int:
+        with torch.no_grad():
+            return int((around_holes(avatar.gaussians(pose), decoded.surface.canonical.faces) & chest).sum())
+
+    before, trust = sieve(), torch.ones(len(avatar))
+    trust[-1] = 0  # something is to be completed
+    complete_avatar(avatar, evidence(trust))
+    assert before > 100 and sieve() < before / 5

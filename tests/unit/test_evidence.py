@@ -75,6 +75,19 @@ def test_other_frames_fill_what_these_do_not_show():
     torch.testing.assert_close(shown.filled(hidden).trust, shown.trust)
 
 
+def test_what_shows_between_others_keeps_its_colour_and_tells_none():
+    shown, hidden = evidence_of(*sheet(1.0)), evidence_of(*sheet(1.0), alpha=0.0)
+    kept = hidden.with_colors_of(shown)
+    assert (kept.trust == 1).all() and (kept.source == 0).all()
+    torch.testing.assert_close(kept.color, shown.color)
+
+
+def test_a_vertex_a_hair_behind_those_around_it_is_seen_with_them():
+    points, faces = sheet(1.0)
+    points[66, 2] -= 0.03
+    assert evidence_of(points, faces).trust[66] == 1
+
+
 def test_without_frames_there_is_no_evidence():
     with pytest.raises(ValueError, match="frame"):
         gather_evidence([], SimpleNamespace(canonical=SimpleNamespace(faces=None)))
