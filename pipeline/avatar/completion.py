@@ -83,7 +83,8 @@ def closed(avatar: Avatar, decoded: Decoded, segments: Segments, evidence: Evide
 
 def with_completed_scales(decoded: Decoded, segments: Segments, trust: Tensor, covers: float) -> Decoded:
     """What was decoded with scales completed by ``covers``, a log scale, where trust, [N], is weak."""
-    scales = complete_log_scales(segments, *_arrays(decoded.log_scale, trust), (covers, covers, FLAT))
+    log_scale, known = _arrays(decoded.log_scale, trust)
+    scales = complete_log_scales(segments, log_scale, known, (covers, covers, FLAT))
     return dataclasses.replace(decoded, log_scale=torch.from_numpy(scales).to(decoded.log_scale))
 
 
