@@ -1,4 +1,4 @@
-"""Words on the command line that would do nothing: refused, with what to write instead.
+"""Words on the command line that would do nothing, or name what is not there: refused before anything runs.
 
 A word acts on the tasks that are asked for. ``source=`` is the footage of a subject that ``subject=`` names,
 a setting belongs to a stage that runs, and ``cluster=`` to a study that runs on one. What a stage cannot use
@@ -8,6 +8,7 @@ under its other settings it declares itself (``Stage.idle``).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 
 from pipeline.config.request import Request
 from pipeline.config.subjects import Subject, known_subjects
@@ -74,6 +75,7 @@ def check_effect(
         except UserError:
             continue  # the stage itself reports it
         check_settings_act(job, run)
+        check_paths_exist(job, run)
 
 
 def with_what_is_viewed(request: Request, tasks: Sequence[str]) -> list[str]:
@@ -176,3 +178,19 @@ def check_settings_act(job: Job, run: Collection[str]) -> None:
             f"source={job.request.source} has no effect on '{subject.name}', which is made up and not filmed "
             "(ingest.mannequin): name another subject"
         )
+
+
+def check_paths_exist(job: Job, run: Collection[str]) -> None:
+    """Refuse a file or folder that the command line names for a stage and that is not there.
+
+    The stage would say so itself, the last of them after the avatar was trained. Stages on request take
+    more than paths.
+    """
+    for name in run:
+        if job.stages[name].on_request:
+            continue
+        for setting in job.stages[name].path_settings:
+            value = getattr(job.settings[name], setting)
+            named = f"{name}.{setting}" in job.request.overrides and ("/" in value or Path(value).suffix)
+            if named and not Path(value).exists():
+                raise UserError(f"{name}.{setting}={value}: there is no such file or folder")

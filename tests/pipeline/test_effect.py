@@ -40,6 +40,7 @@ def refused(toy, *words, saying):
         (("subject=ann", "subject=bob"), ("subject= stands twice",)),
         (("subject=ann", "bend.angle=1", "bend.angle=2"), ("bend.angle= stands twice",)),
         (("subject=made", "source={clip}"), ("made up and not filmed",)),
+        (("subject=ann", "gather.extra=nowhere/extra.txt"), ("gather.extra=", "no such file or folder")),
     ],
 )
 def test_a_word_without_effect_is_refused_and_nothing_runs(toy, words, saying):
