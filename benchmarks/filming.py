@@ -245,6 +245,8 @@ def headline(rows: list[dict[str, Any]]) -> str:
                 for side in ("front", "turned")
             }
             parts.append(f"{name} {gain['front']:+.1f} / {gain['turned']:+.1f} dB")
+    if not parts:
+        return f"{len(rows)} takes, none beside the good one"
     return "front / turned by 40 degrees against the good take: " + ", ".join(parts)
 
 
