@@ -28,7 +28,7 @@ def idle(settings: IngestSettings) -> dict[str, str]:
 
 STAGE = Stage(
     name="ingest",
-    version=6,
+    version=7,
     settings=IngestSettings,
     run="stages.ingest.run:run",
     assets=lambda settings: settings.assets,

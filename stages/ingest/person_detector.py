@@ -23,6 +23,7 @@ node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream:
 """
 SEEN_SIDE = 448  # pixels; a larger picture shows the detector no more
 _ONE = 0.35  # detections nearer than this, in the larger one's radius, are one person
+_CUT = 0.35  # of the radius: torsos nearer than this to a square's edge are cut
 _BINS, _LEAST_PIXELS = 16, 12  # of a colour histogram: bins of lightness; pixels across a torso
 
 
@@ -71,7 +72,9 @@ class PersonDetector:
             part = np.ascontiguousarray(image[top : top + side, left : left + side])
             scale = min(1.0, SEEN_SIDE / max(part.shape[:2]))
             small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            found += self._detect(small, np.array([left, top]), 1 / scale)
+            inside = self._detect(small, np.array([left, top]), 1 / scale)
+            edges = inner_edges((left, top, side), *image.shape[1::-1])
+            found += [one for one in inside if not is_cut(one, edges)]
         return [dataclasses.replace(one, colors=torso_colors(image, one)) for one in distinct(found)]
 
     def _detect(self, image: np.ndarray, corner: np.ndarray, scale: float) -> list[Person]:
@@ -94,6 +97,27 @@ def squares(width: int, height: int) -> list[tuple[int, int, int]]:
         return []
     starts = np.linspace(0, length - side, 1 + int(np.ceil((length - side) / (side / 2)))).astype(int)
     return [(int(at), 0, side) if width > height else (0, int(at), side) for at in starts]
+
+
+def inner_edges(square: tuple[int, int, int], width: int, height: int) -> np.ndarray:
+    """Where a square (left, top, side) cuts the picture: least x and y, greatest x and y, [2, 2].
+
+    Infinite where its edge is the picture's own, or lies outside.
+    """
+    left, top, side = square
+    low = [left if left > 0 else -np.inf, top if top > 0 else -np.inf]
+    high = [left + side if left + side < width else np.inf, top + side if top + side < height else np.inf]
+    return np.array([low, high])
+
+
+def is_cut(person: Person, edges: np.ndarray) -> bool:
+    """Whether hips or shoulders lie so near an edge of ``inner_edges`` that the square shows half a body.
+
+    Of somebody's arm at such an edge the detector makes a person, who stands on the head. The squares overlap
+    by half, so that another, or the whole picture, shows whoever is cut.
+    """
+    points = np.stack([person.hips, person.shoulders])
+    return bool((np.minimum(points - edges[0], edges[1] - points) < _CUT * person.radius).any())
 
 
 def distinct(found: Sequence[Person]) -> list[Person]:

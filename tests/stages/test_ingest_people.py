@@ -12,7 +12,15 @@ from pipeline.errors import UserError
 from stages.ingest.cameras.calibration import CalibratedCamera, pinhole_lens
 from stages.ingest.cuts import FilmShot, choose_shot, film_shots, find_cuts
 from stages.ingest.people import Track, color_overlap, link_detections, track_people
-from stages.ingest.person_detector import Person, change_since, distinct, squares, torso_colors
+from stages.ingest.person_detector import (
+    Person,
+    change_since,
+    distinct,
+    inner_edges,
+    is_cut,
+    squares,
+    torso_colors,
+)
 from stages.ingest.same_person import KnownPerson, rays_meet
 
 RED, GREEN = np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.1, 0.9])
@@ -230,3 +238,16 @@ def test_without_a_calibration_colours_find_the_person():
     looks = [(frame, [person(50, 60, colors=GREEN), person(150, 30, colors=RED)]) for frame in range(4)]
     chosen = track_people(looks, 200, 100, choose=lambda people: known.among(people, None, 0))
     assert chosen.subject.at(0).shoulders[0] == 150 and len(chosen.others) == 1
+
+
+def test_half_a_body_at_a_squares_edge_is_nobody():
+    """An arm cut by the left square of three was somebody who stood on the head, and the mask lost the arm."""
+    arm = Person(np.array([682.0, 495.0]), np.array([661.0, 636.0]), 277.0, 0.66)
+    left, middle = (inner_edges(square, 1280, 720) for square in squares(1280, 720)[:2])
+    assert is_cut(arm, left) and not is_cut(arm, middle)
+
+
+def test_what_the_picture_itself_cuts_is_somebody():
+    at_the_border = Person(np.array([20.0, 900.0]), np.array([20.0, 500.0]), 500.0, 0.9)
+    for square in [(0, 0, 1280), squares(1280, 720)[0]]:
+        assert not is_cut(at_the_border, inner_edges(square, 1280, 720))
