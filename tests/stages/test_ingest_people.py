@@ -241,7 +241,7 @@ def test_without_a_calibration_colours_find_the_person():
 
 
 def test_half_a_body_at_a_squares_edge_is_nobody():
-    """An arm cut by the left square of three was somebody who stood on the head, and the mask lost the arm."""
+    """An arm that a square cut was somebody who stood on the head, and the mask lost the arm."""
     arm = Person(np.array([682.0, 495.0]), np.array([661.0, 636.0]), 277.0, 0.66)
     left, middle = (inner_edges(square, 1280, 720) for square in squares(1280, 720)[:2])
     assert is_cut(arm, left) and not is_cut(arm, middle)
