@@ -23,6 +23,7 @@ from pipeline.store.artifact import Artifact
 REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
 
+CROWDED = 1.5  # running processes a core
 GO = b"go\n"
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 
@@ -117,19 +118,26 @@ def process_environment() -> dict[str, str]:
 
     A process that has it is given the same again. The malloc thresholds keep large activations on the heap
     instead of asking the kernel for fresh zeroed pages at every step; they must be set before Python starts.
-    Threads that wait sleep: beside other jobs one that spins holds the core that its partner waits for, and
-    a training step of two threads took twenty times as long (docs/results.md, "Crowded machines").
+    Threads that wait sleep on a crowded machine: one that spins there holds the core that its partner waits
+    for, and a training step takes up to twenty times as long; on an idle one spinning is a third faster
+    (docs/results.md, "Crowded machines").
     """
     defaults = {
         "MALLOC_MMAP_THRESHOLD_": "4294967296",
         "MALLOC_TRIM_THRESHOLD_": "4294967296",
         "MALLOC_TOP_PAD_": "268435456",
-        "OMP_WAIT_POLICY": "PASSIVE",
+        **({"OMP_WAIT_POLICY": "PASSIVE"} if is_crowded() else {}),
     }
     # Once only: a process that starts itself again until its environment is this one must come to an end.
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     places = [str(REPOSITORY), *(place for place in given if place and place != str(REPOSITORY))]
     return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(places)}
+
+
+def is_crowded() -> bool:
+    """Whether other jobs want the cores, by the last minute's load; False where nobody counts it."""
+    counted = hasattr(os, "getloadavg")
+    return counted and os.getloadavg()[0] > CROWDED * (os.cpu_count() or 1)
 
 
 def killed_by(number: int) -> str:

@@ -21,6 +21,7 @@ from pipeline.body import mean_identity
 from pipeline.errors import UserError
 from pipeline.untrusted import parse_json
 from stages.train import run as stage
+from stages.train.frame_evidence import settle_unseen
 from stages.train.visibility_gate import VisibilityGate
 from tests.made.body import open_body
 from tests.made.portrait import TINY, context_for, trainer_for, with_poses
@@ -105,7 +106,8 @@ def test_a_gate_that_would_take_everything_stays_open_and_says_so(subject, tmp_p
     values = trainer.step()
     assert np.isfinite(list(values.values())).all()
     (tmp_path / "written").mkdir()
-    trainer.hooks["gate"].write(tmp_path / "written")
+    evidence = settle_unseen(trainer.avatar, trainer.poses, trainer.data, trainer.settings)
+    trainer.hooks["gate"].write(tmp_path / "written", evidence)
     assert parse_json(tmp_path / "written" / "gate.json", "")["tau"] == 0
 
 

@@ -2,6 +2,8 @@
 
 import os
 
+import pytest
+
 from pipeline.config.workspace import REPOSITORY
 from pipeline.run.process import process_environment
 
@@ -16,8 +18,10 @@ def test_the_environment_of_the_environment_is_itself(monkeypatch):
     assert process_environment() == first
 
 
-def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch):
+@pytest.mark.parametrize(("load", "policy"), [(0.2, None), (100.0, "PASSIVE")])
+def test_waiting_threads_sleep_where_others_want_the_cores(monkeypatch, load, policy):
+    monkeypatch.setattr(os, "getloadavg", lambda: (load * os.cpu_count(), 0.0, 0.0))
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    assert process_environment()["OMP_WAIT_POLICY"] == "PASSIVE"
+    assert process_environment().get("OMP_WAIT_POLICY") == policy
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     assert process_environment()["OMP_WAIT_POLICY"] == "ACTIVE"
