@@ -3,6 +3,10 @@
 from pipeline.run.stage import Stage
 from stages.fit.settings import FitSettings
 
+_FITTING = (
+    "iterations", "learning_rate", "smoothing_seconds", "lambda_silhouette", "lambda_lids", "lambda_gaze",
+)  # fmt: skip
+
 
 def idle(settings: FitSettings) -> dict[str, str]:
     """The settings that cannot act beside the others, and what to write."""
@@ -13,13 +17,14 @@ def idle(settings: FitSettings) -> dict[str, str]:
         found["given"] = "fit.pose_init is started from: leave out one of the two"
     if settings.given == "keep":
         remedy = "poses that are kept are not fitted: leave out fit.given=keep"
-        found.update(dict.fromkeys(("iterations", "learning_rate", "smoothing_seconds", "face"), remedy))
+        found.update(dict.fromkeys((*_FITTING, "face"), remedy))
     if not settings.flame_fit or settings.face != "flame":
         found["lambda_flame_init"] = "FLAME is not fitted: set fit.face=flame and fit.flame_fit=true"
     if settings.face != "flame":
         found["flame_fit"] = "there is no FLAME to fit: set fit.face=flame and fit.flame_model"
     if not settings.iterations:
-        found["learning_rate"] = "no step is taken: raise fit.iterations"
+        remedy = "no step is taken: raise fit.iterations"
+        found.update(dict.fromkeys(("learning_rate", "lambda_silhouette"), remedy))
     return found
 
 

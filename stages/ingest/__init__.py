@@ -19,6 +19,10 @@ def idle(settings: IngestSettings) -> dict[str, str]:
     if settings.masks not in ("auto", "mediapipe"):
         remedy = "masks that are given are used as they are: leave out ingest.masks, or this"
         found.update(dict.fromkeys(("mask_edge", "mask_parts", "mask_steadiness", "background"), remedy))
+    if not settings.uses_estimator:
+        remedy = "keypoints and masks are given, MediaPipe looks at nothing: leave out one of them, or this"
+        estimators = ("pose_model", "estimator_long_side", "estimator_short_side")
+        found.update(dict.fromkeys(estimators, remedy))
     if settings.test_frames:
         found["test_fraction"] = "ingest.test_frames says how many: leave out one of the two"
     if settings.cameras in ("pinhole", "sfm"):
