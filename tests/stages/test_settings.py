@@ -1,5 +1,6 @@
 """Every setting of every stage: what is out of range, not finite or of another type is refused by name."""
 
+import dataclasses
 import math
 
 import pytest
@@ -7,6 +8,10 @@ import pytest
 from pipeline.config.settings import Layer, read_fields, resolve, schemas
 from pipeline.errors import UserError
 from pipeline.run.stage import load_stages
+from stages import fit as fit_stage
+from stages import ingest as ingest_stage
+from stages.fit.settings import FitSettings
+from stages.ingest.settings import IngestSettings
 
 KINDS = {name: stage.settings for name, stage in load_stages().items()}
 FIELDS = [(stage, field) for stage, kind in KINDS.items() for field in schemas(kind)]
@@ -126,3 +131,12 @@ def test_what_once_passed_is_refused(stage, field, text):
 
 def test_no_subdivision_needs_no_time_for_it():
     assert resolve(KINDS, [Layer("here", {"train": {"subdivide_from": 1, "subdivisions": 0}})])
+
+
+def test_what_cannot_act_beside_given_detections_and_kept_poses_is_refused():
+    given = IngestSettings(keypoints="points", masks="masks", pose_model="heavy")
+    assert "pose_model" in ingest_stage.idle(given)
+    assert "pose_model" not in ingest_stage.idle(dataclasses.replace(given, masks="auto"))
+    assert "lambda_silhouette" in fit_stage.idle(FitSettings(pose_init="poses", given="keep"))
+    assert "lambda_silhouette" in fit_stage.idle(FitSettings(iterations=0))
+    assert "lambda_silhouette" not in fit_stage.idle(FitSettings())
