@@ -78,7 +78,7 @@ def _seen(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Centres [M, 3] of the Gaussians that are seen, and how far they reach around these [M], metres."""
     means, sizes = gaussians.means.double(), gaussians.scales.double()
     seen = (gaussians.opacities > _OPAQUE) & means.isfinite().all(1) & sizes.isfinite().all(1)
-    return means[seen].numpy(), _REACH * sizes[seen].amax(1).numpy()
+    return means[seen].cpu().numpy(), _REACH * sizes[seen].amax(1).cpu().numpy()
 
 
 def _box(places: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -76,7 +76,7 @@ def closed(avatar: Avatar, decoded: Decoded, segments: Segments, evidence: Evide
     expression = still.new_zeros(mesh.expression_directions.shape[-1])
     pose = Pose(relaxed_pose(ARMS).to(still), expression, still)
     sieve = dilate(around_holes(avatar.pose(completed, pose).gaussians, mesh.faces), mesh.faces, rings=1)
-    larger = torch.maximum(completed.log_scale, still.new_tensor([covers, covers, FLAT]))
+    larger = torch.maximum(completed.log_scale, torch.tensor([covers, covers, FLAT], device=avatar.device))
     log_scale = torch.where(sieve[:, None], larger, completed.log_scale)
     return dataclasses.replace(completed, log_scale=log_scale)
 

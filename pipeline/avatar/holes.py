@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pipeline.body import rasterize
+from pipeline.device import moved
 from pipeline.orbit_cameras import orbit, visible_extent
 from pipeline.splat import Gaussians, render
 
@@ -35,7 +36,7 @@ def around_holes(
         faces: int64, of the surface between them.
     """
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=faces.device)
-    for camera in orbit(visible_extent(gaussians), WIDTH, HEIGHT, ANGLES):
+    for camera in moved(orbit(visible_extent(gaussians), WIDTH, HEIGHT, ANGLES), faces.device):
         raster = rasterize(camera, gaussians.means, faces)
         alpha = render(gaussians, camera).alpha.cpu().numpy()
         holes = inner_silhouette(raster.covered) & (alpha < CLOSED)
