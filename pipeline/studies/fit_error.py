@@ -14,7 +14,7 @@ from pipeline.clip.curves import read_curve
 from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table, vectors
-from pipeline.studies.variants import Base, Result, run_record
+from pipeline.studies.variants import Result, run_record
 
 FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0)  # of the base's own number of steps
 SEEN = 2  # the state of a true point that the camera sees (stages/ingest/mannequin/truth.py)
@@ -24,12 +24,7 @@ TRUTH = pa.schema(
 ANCHOR = "neck"  # in the picture whatever the framing; bodies are aligned there, frame by frame
 
 
-def fit_steps(own: int) -> list[int]:
-    """The numbers of steps that are compared, increasing."""
-    return sorted({max(1, round(own * factor)) for factor in FACTORS})
-
-
-def fit_numbers(base: Base, result: Result) -> dict[str, float | str]:
+def fit_numbers(result: Result, body_file: Path) -> dict[str, float | str]:
     """The time and error of one registration.
 
     Returns:
@@ -46,7 +41,7 @@ def fit_numbers(base: Base, result: Result) -> dict[str, float | str]:
         "seconds": timings.get("registration_seconds", math.nan) if processor is None else processor,
         "clock": "wall-clock" if processor is None else "processor",
         "pixels": pixels[-1][1] if pixels else math.nan,
-        "millimetres": truth_error(ingest, fit, base.request.workspace.body_file),
+        "millimetres": truth_error(ingest, fit, body_file),
     }
 
 

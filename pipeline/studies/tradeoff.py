@@ -13,26 +13,32 @@ from pipeline.clip.curves import read_curve
 from pipeline.config.request import Request
 from pipeline.errors import UserError
 from pipeline.run.job import Job
-from pipeline.studies.fit_error import fit_numbers, fit_steps
+from pipeline.studies.fit_error import FACTORS, fit_numbers
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import curves, scatter
-from pipeline.studies.report import Page, Picture, Section, closing_sections, publish, sizes_of, study_folder
-from pipeline.studies.search import Run, Search, point_table, seconds_of, spoken
+from pipeline.studies.report import Page, Picture, Section, publish
+from pipeline.studies.search import (
+    Search,
+    combinations,
+    frontier,
+    noise_of,
+    overrides_of,
+    point_table,
+    seconds_of,
+    spoken,
+    worth_of,
+)
 from pipeline.studies.sweep import (
     GAUSSIANS,
     PRECISION,
     REPRESENTATION,
     Level,
-    combinations,
-    frontier,
-    noise_of,
-    overrides_of,
     setting_of,
+    sizes_of,
     sweep_levels,
-    worth_of,
 )
 from pipeline.studies.tables import MAIN, NOTE, Table
-from pipeline.studies.variants import Base, Result, Settings, Variant, base_of, run_record
+from pipeline.studies.variants import Base, Result, Variant, base_of, run_record
 
 DEFAULT_BUDGET = "20m"
 COLUMNS = [
@@ -87,7 +93,7 @@ def tradeoff(subject: str, request: Request) -> Path:
         UserError: a setting is wrong, or the base itself failed.
     """
     text = request.budget or DEFAULT_BUDGET
-    budget, folder = seconds_of(text), study_folder(request.workspace.data, "tradeoff", subject)
+    budget, folder = seconds_of(text), request.workspace.data / "studies" / "tradeoff" / subject
     base = base_of(subject, request, folder / "log.txt")
     levels = sweep_levels(base.settings)
     print(f"tradeoff of {subject}: {len(levels)} levels alone, then what combines, within {text}", flush=True)
@@ -105,11 +111,10 @@ def tradeoff(subject: str, request: Request) -> Path:
     fits = run_fits(search)
     search.make_affordable((level,) for level in levels)
     presets, expected = run_presets(search, levels)
-    search.make_affordable(combinations(search.points()))
-
-    runs: list[Run] = [(one, design, "" if design else base.preset) for design, one in search.results.items()]
-    runs += [(result, None, preset) for preset, result in presets.items()]
-    points = point_table(runs, meters[0].speeds(result for result, _, _ in runs))
+    search.make_affordable(combinations(point_table(search.results)))
+    speeds = meters[0].speeds([*search.results.values(), *presets.values()])
+    points = point_table(search.results, presets, speeds)
+    points.loc[1, "preset"] = base.preset
     write_tradeoff(folder, Tradeoff(base, points, expected, fits, budget, search.spent))
     return folder
 
@@ -118,18 +123,18 @@ def run_fits(search: Search) -> pd.DataFrame:
     """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
     own = max(1, search.base.settings["fit"].iterations)
     rows: dict[int, Mapping[str, float | str]] = {}
-    for steps in fit_steps(own):
-        overrides = {"fit.iterations": str(steps)}
+    for steps in sorted({max(1, round(own * factor)) for factor in FACTORS}):
+        variant = Variant(f"fit of {steps} steps", {"fit.iterations": str(steps)})
         seconds = search.results[()].seconds["fit"] * steps / own
         late = search.spent + seconds > search.budget / 4
-        if rows and late and search.base.missing("fit", overrides):
-            print(f"fit of {steps} steps is left out: the budget")
+        if rows and late and search.base.missing("fit", variant.overrides):
+            print(f"{variant.name} is left out: the budget")
             continue
-        result = search.base.run(Variant(f"fit of {steps} steps", overrides), ["fit"])
+        result = search.base.run(variant, ["fit"])
         if result.failure:
-            print(f"fit of {steps} steps failed: {result.failure}")
+            print(f"{variant.name} failed: {result.failure}")
         else:
-            rows[steps] = fit_numbers(search.base, result)
+            rows[steps] = fit_numbers(result, search.base.request.workspace.body_file)
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -139,14 +144,14 @@ def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Resu
     results, expected = {}, {}
     for path in sorted((search.base.request.workspace.definitions("presets")).glob("*.toml")):
         base = search.base.under_preset(path.stem)
-        expected[path.stem] = expected_cost(search, base.job(), levels)
-        seconds = expected[path.stem] * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
-        if base.missing("train", {}) and seconds > (search.budget - search.spent) / 2:
-            continue
-        result = search.run(base, Variant(f"preset {path.stem}"))
-        if not result.failure:
-            results[path.stem] = result
-            del expected[path.stem]
+        cost = expected_cost(search, base.job(), levels)
+        seconds = cost * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
+        if seconds <= (search.budget - search.spent) / 2 or not base.missing("train", {}):
+            result = search.run(base, Variant(f"preset {path.stem}"))
+            if not result.failure:
+                results[path.stem] = result
+                continue
+        expected[path.stem] = cost
     return results, expected
 
 
@@ -162,31 +167,17 @@ def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
     planned = done / own.effort if not own.iterations else done
     cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
     for level in levels:
-        if level.parameter not in (GAUSSIANS, PRECISION, REPRESENTATION):
-            continue
-        if all(_text(job.settings, name) == text for name, text in level.overrides):
+        if level.parameter in (GAUSSIANS, PRECISION, REPRESENTATION) and all(
+            str(setting_of(job.settings, name)).lower() == text for name, text in level.overrides.items()
+        ):
             cost *= search.cost_ratio(level)
     return cost
 
 
-def _text(settings: Settings, name: str) -> str:
-    """The value of a setting as a command line has it."""
-    return str(setting_of(settings, name)).lower()
-
-
-def numbered(points: pd.DataFrame) -> pd.DataFrame:
-    """The points, indexed by ``number. label``."""
-    return points.set_axis(points.index.astype(str) + ". " + points["label"])
-
-
 def write_tradeoff(folder: Path, study: Tradeoff) -> None:
     """Writes the tables, the plots and the page."""
-    tables, points = tables_of(study), numbered(study.points)
+    tables, points = tables_of(study), study.points.set_index("label")
     failed = [result.variant for result in points["result"] if result.failure]
-    changed = {
-        name: {"preset": point["preset"]} if point["design"] is None else overrides_of(point["design"])
-        for name, point in points.iterrows()
-    }
     lines = [
         f"Settings that were tried within {spoken(study.budget)}: {len(points)}; each level of each sweep "
         "parameter alone, then combinations of those that gained most for their time. Gains smaller than "
@@ -196,9 +187,13 @@ def write_tradeoff(folder: Path, study: Tradeoff) -> None:
     sections = [
         Section("The frontier", frontier_lines(study), pictures=plots(folder, study)),
         *(Section(table.title, tables=[table]) for table in tables),
-        *closing_sections(study.base, changed, points["result"].to_dict(), study.seconds),
     ]
-    page = Page(f"{study.base.subject}: what accuracy costs", headline(study), lines, sections)
+    changed = {
+        name: {"preset": point["preset"]} if point["design"] is None else overrides_of(point["design"])
+        for name, point in points.iterrows()
+    }
+    title, results = f"{study.base.subject}: what accuracy costs", points["result"].to_dict()
+    page = Page(title, headline(study), lines, sections, study.base, changed, results, study.seconds)
     publish(folder, page, pd.concat([table.values(study.base.subject) for table in tables]))
 
 
@@ -216,7 +211,7 @@ def tables_of(study: Tradeoff) -> list[Table]:
     failures = points["result"].map(lambda one: one.failure and f"failed: {one.failure}")
     presets = ("preset " + points["preset"]).where(points["preset"].ne("") & points["design"].notna(), "")
     rows = points.assign(**{NOTE: failures + presets, MAIN: points.index.isin(study.frontier())})
-    rows = numbered(rows)[[*COLUMNS, NOTE, MAIN]]
+    rows = rows.set_index("label").rename_axis(None)[[*COLUMNS, NOTE, MAIN]]
     tables = [Table("tradeoff", f"What accuracy costs: {study.base.subject}", caption, rows)]
     if not study.fits.empty:
         told = (
@@ -230,18 +225,12 @@ def tables_of(study: Tradeoff) -> list[Table]:
 
 
 TRAINING = "processor seconds of training, views included"
+ANIMATION = "processor milliseconds to animate a frame"
 PLOTS = (
     # file, cost, metric, factor, label of the costs, label of the metric
     ("psnr_over_training", "train_s", "psnr", 1, TRAINING, "PSNR, dB"),
     ("lpips_over_training", "train_s", "lpips_alex", 100, TRAINING, "LPIPS×100"),
-    (
-        "psnr_over_animation",
-        "animation_ms",
-        "psnr",
-        1,
-        "processor milliseconds to animate a frame",
-        "PSNR, dB",
-    ),
+    ("psnr_over_animation", "animation_ms", "psnr", 1, ANIMATION, "PSNR, dB"),
 )
 FIT_PLOTS = (
     ("fit_pixels", "pixels", "Reprojection error, px"),
@@ -255,8 +244,7 @@ CURVES = (
 
 def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     """Draws every plot there is something for."""
-    points = study.points.assign(base=study.points.index == 1)
-    pictures = []
+    pictures, points, fits = [], study.points.assign(base=study.points.index == 1), study.fits
     for name, cost, metric, factor, across, up in PLOTS:
         file, shown = folder / f"{name}.png", points.assign(x=points[cost], y=factor * points[metric])
         expected = study.expected if cost == "train_s" else {}
@@ -268,11 +256,8 @@ def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     curves(file, training_curves(study), "wall-clock seconds of training", up)
     pictures.append((file, CURVES))
     for name, error, up in FIT_PLOTS:
-        if error in study.fits and study.fits[error].notna().any():
-            file, shown = (
-                folder / f"{name}.png",
-                study.fits.assign(x=study.fits["seconds"], y=study.fits[error]),
-            )
+        if error in fits and fits[error].notna().any():
+            file, shown = folder / f"{name}.png", fits.assign(x=fits["seconds"], y=fits[error])
             scatter(file, shown, frontier(shown["x"], -shown["y"]), "seconds of registration", up)
             told = f"{up.partition(',')[0]} against the registration's seconds; numbers are steps."
             pictures.append((file, told))
@@ -286,13 +271,13 @@ def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
     """
     edge = study.frontier()
     order = sorted(study.points.index, key=lambda n: (n != 1, n not in edge, -study.points["psnr"][n]))
-    results, lines = numbered(study.points.loc[order])["result"], {}
-    for name, result in results.items():
-        if result.folders.get("ingest") == results.iloc[0].folders["ingest"]:
+    lines = {}
+    for label, result in study.points.loc[order, ["label", "result"]].itertuples(index=False):
+        if result.folders.get("ingest") == study.points.loc[1, "result"].folders["ingest"]:
             train, remedy = result.folders["train"], "run the train stage again"
             seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"].get("curve_seconds", [])}
             line = read_curve(train / "curve.parquet", remedy).get("psnr", [])
-            lines[name] = [(seconds[step], value) for step, value in line if step in seconds]
+            lines[label] = [(seconds[step], value) for step, value in line if step in seconds]
     return lines
 
 
@@ -300,8 +285,8 @@ def frontier_lines(study: Tradeoff) -> list[str]:
     """The frontier in words, the cheapest first, and how far presets lie from it."""
     points, edge = study.points, study.frontier()
     lines = [
-        f"{name}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
-        for name, point in numbered(points.loc[edge]).iterrows()
+        f"{point['label']}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
+        for _, point in points.loc[edge].iterrows()
     ]
     for number, point in points[points["preset"].ne("")].iterrows():
         where = "on" if number in edge else f"{point['short']:.2f} dB under"
@@ -334,7 +319,7 @@ def idle_change(study: Tradeoff, noise: float) -> str:
         sizes = sizes_of(study.base.settings)
         return f"{chance}: stay with {base['gaussians']:,.0f} Gaussians and {sizes}"
     perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
-    return f"{chance}: {as_good['label']}, at {times(as_good)}, does as well in PSNR ({perceived})"
+    return f"{chance}: {as_good['result'].variant}, at {times(as_good)}, does as well in PSNR ({perceived})"
 
 
 def change(point: pd.Series, base: pd.Series) -> str:
