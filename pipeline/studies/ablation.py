@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -58,28 +57,19 @@ class Ablation:
     """The results of an ablation.
 
     Attributes:
-        results: (subject, key of the variant) -> result.
-        speeds: as ``AvatarMeter.speeds`` gives them.
+        scores: as ``score_table`` gives them, indexed by ``subject`` and ``variant``, the variant's key.
         dataset: the one that all subjects belong to; empty if none.
         refined: whether the scores are those with held-out poses refined, as on NeuMan.
     """
 
-    results: Mapping[tuple[str, str], Result]
-    speeds: Mapping[Path, Numbers]
+    scores: pd.DataFrame
     dataset: str = ""
     refined: bool = False
-
-    @functools.cached_property
-    def scores(self) -> pd.DataFrame:
-        """A row a result, indexed like the results; columns as in ``score_table``."""
-        method = "avatar_refined" if self.refined else "avatar"
-        scores = score_table(list(self.results.values()), self.speeds, method)
-        return scores.set_axis(pd.MultiIndex.from_tuples(self.results, names=["subject", "variant"]))
 
     @property
     def subjects(self) -> list[str]:
         """Whose avatars."""
-        return list(dict.fromkeys(subject for subject, _ in self.results))
+        return self.scores.index.unique("subject").tolist()
 
     def gains(self, metric: str) -> pd.Series:
         """Key of a variant -> its mean difference from the whole method, over the subjects that have both.
@@ -93,7 +83,7 @@ class Ablation:
 
 
 def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
-    """Runs every variant of the subjects and writes tables, plots and page.
+    """Runs every variant of the subjects, one after the other, and writes tables, plots and page.
 
     Args:
         name: of the study: a subject, or a dataset.
@@ -107,39 +97,32 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
         UserError: a setting is wrong, or nothing at all could be made.
     """
     start, folder = time.monotonic(), request.workspace.data / "studies" / "ablate" / name
-    bases, results = run_all(subjects, request, folder / "log.txt")
-    if all(result.failure for result in results.values()):
-        raise UserError(next(iter(results.values())).failure)
-    speeds: dict[Path, Numbers] = {}
-    for subject, base in bases.items():  # each subject's avatars are timed together
-        done = [one for one in results.values() if one.subject == subject and not one.failure]
-        if done:
-            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
-    refined = all(counts_refined(base) for base in bases.values())
-    ablation = Ablation(results, speeds, dataset_of(subjects, request), refined)
-    write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
-    return folder
-
-
-def run_all(
-    subjects: Sequence[str], request: Request, log: Path
-) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
-    """Every variant of every subject, a subject after the other; and the bases that could be read."""
     bases: dict[str, Base] = {}
     results: dict[tuple[str, str], Result] = {}
+    speeds: dict[Path, Numbers] = {}
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
-                bases[subject] = base_of(subject, request, log, views_of(subject, request))
+                base = base_of(subject, request, folder / "log.txt", views_of(subject, request))
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
                 continue
-            for key, variant in variants_of(bases[subject]).items():
-                results[subject, key] = bases[subject].run(variant)
-                print(results[subject, key].line, flush=True)
+            bases[subject], done = base, []
+            for key, variant in variants_of(base).items():
+                result = results[subject, key] = base.run(variant)
+                done += [] if result.failure else [result]
+                print(result.line, flush=True)
                 progress.advance(1, variant.name)
-    return bases, results
+            if done:  # each subject's avatars are timed together
+                speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
+    if all(result.failure for result in results.values()):
+        raise UserError(next(iter(results.values())).failure)
+    refined = all(counts_refined(base) for base in bases.values())
+    scores = score_table(results, speeds, "avatar_refined" if refined else "avatar")
+    ablation = Ablation(scores.rename_axis(["subject", "variant"]), dataset_of(subjects, request), refined)
+    write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
+    return folder
 
 
 def views_of(subject: str, request: Request) -> Mapping[str, str]:
@@ -214,7 +197,7 @@ def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
     notes, count = [], len(ablation.subjects)
     for subject in ablation.subjects:
         of = f" ({subject})" if count > 1 else ""
-        one, full = (ablation.results[subject, name] for name in (key, FULL))
+        one, full = (ablation.scores.loc[(subject, name), "result"] for name in (key, FULL))
         if one.failure:
             notes.append(f"failed{of}: {one.failure}")
         elif key not in (FULL, CHANCE) and not full.failure and avatar_digest(one) == avatar_digest(full):
@@ -261,7 +244,7 @@ def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seco
     sections = [Section("At a glance", pictures=pictures), Section("The paper's tables", tables=tables)]
     lines = [f"Subjects: {', '.join(ablation.subjects)}."] if several else []
     changed = {one.name: one.overrides for one in variants_of(base).values()}
-    results = {f"{o.subject}, {o.variant}" if several else o.variant: o for o in ablation.results.values()}
+    results = {f"{o.subject}, {o.variant}" if several else o.variant: o for o in ablation.scores["result"]}
     title = f"{name}: what each part is worth"
     page = Page(title, headline(ablation), lines, sections, base, changed, results, seconds)
     publish(folder, page, values_of(tables, ablation))

@@ -24,22 +24,18 @@ TRUTH = pa.schema(
 ANCHOR = "neck"  # in the picture whatever the framing; bodies are aligned there, frame by frame
 
 
-def fit_numbers(result: Result, body_file: Path) -> dict[str, float | str]:
+def fit_numbers(result: Result, body_file: Path) -> dict[str, float]:
     """The time and error of one registration.
 
     Returns:
-        ``seconds`` of the registration alone; their ``clock``, wall-clock for a version from before processor
-        seconds were noted; ``pixels``, the mean distance of trusted keypoints from where they were detected;
-        ``millimetres``, the mean distance of the joints that the camera sees from the truth, aligned at the
-        neck, NaN where no truth is known.
+        ``seconds``, processor seconds of the registration alone; ``pixels``, the mean distance of trusted
+        keypoints from where they were detected; ``millimetres``, the mean distance of the joints that the
+        camera sees from the truth, aligned at the neck, NaN where no truth is known.
     """
     ingest, fit = result.folders["ingest"], result.folders["fit"]
-    timings = run_record(fit)["timings"]
-    processor = timings.get("registration_cpu_seconds")
     pixels = read_curve(fit / "curve.parquet", "run the fit stage again").get("pixels", [])
     return {
-        "seconds": timings.get("registration_seconds", math.nan) if processor is None else processor,
-        "clock": "wall-clock" if processor is None else "processor",
+        "seconds": run_record(fit)["timings"]["registration_cpu_seconds"],
         "pixels": pixels[-1][1] if pixels else math.nan,
         "millimetres": truth_error(ingest, fit, body_file),
     }

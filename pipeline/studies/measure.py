@@ -12,8 +12,9 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -21,7 +22,6 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import load_body
-from pipeline.clip.camera import Camera
 from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame, over
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.config.assets import require
@@ -147,7 +147,10 @@ class AvatarMeter:
     def _timed(self, avatars: Mapping[Path, tuple[FittedClip, Posed]]) -> dict[Path, Numbers]:
         clip, _ = next(iter(avatars.values()))
         frames = clip.spread(POSES, "test") or clip.spread(POSES)
-        camera, rows = square(clip.cameras[frames[0]]), []
+        whole, rows = clip.cameras[frames[0]], []
+        side = min(whole.width, whole.height)  # the picture's middle is drawn
+        camera = whole.cropped((whole.width - side) // 2, (whole.height - side) // 2, side, side)
+        camera = camera.resized(SIDE, SIDE)
         for repeat in range(1 + REPEATS):
             for folder, (_, posed) in avatars.items():
                 start = time.process_time()
@@ -163,18 +166,17 @@ class AvatarMeter:
 
 
 def score_table(
-    results: Sequence[Result], speeds: Mapping[Path, Numbers], method: str = "avatar"
+    results: Mapping[Any, Result], speeds: Mapping[Path, Numbers], method: str = "avatar"
 ) -> pd.DataFrame:
     """A row a result: its scores of held-out frames, what it took to make it, and what a frame of it costs.
 
     Args:
-        results: failures too, whose scores are NaN.
+        results: by the row's label; failures too, whose scores are NaN.
         speeds: as ``AvatarMeter.speeds`` gives them.
         method: of evaluate, whose scores count.
 
     Returns:
-        Numbered from 1. Columns are ``result`` and the keys of ``METRICS``; ``train_s`` and ``whole_s`` are
-        processor seconds.
+        Columns are ``result`` and the keys of ``METRICS``; ``train_s`` and ``whole_s`` are processor seconds.
     """
     rows = [
         {
@@ -183,17 +185,10 @@ def score_table(
             "train_s": one.training_cost,
             "whole_s": math.nan if one.failure else sum(one.cpu_seconds.values()),
         }
-        for one in results
+        for one in results.values()
     ]
-    scores = pd.DataFrame(rows, range(1, 1 + len(rows)), list(METRICS), dtype=float)
-    scores["result"] = pd.Series(list(results), scores.index, dtype=object)
+    scores = pd.DataFrame(rows, pd.Index(list(results)), list(METRICS), dtype=float)
+    scores["result"] = pd.Series(list(results.values()), scores.index, dtype=object)
     scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
     scores["fps"] = 1e3 / scores["total_ms"]
     return scores
-
-
-def square(camera: Camera) -> Camera:
-    """The camera's middle as a picture of ``SIDE`` x ``SIDE`` pixels."""
-    side = min(camera.width, camera.height)
-    cropped = camera.cropped((camera.width - side) // 2, (camera.height - side) // 2, side, side)
-    return cropped.resized(SIDE, SIDE)

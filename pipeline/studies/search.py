@@ -143,7 +143,8 @@ def point_table(
         true of another seed, which is no choice; and ``short``, dB under the frontier, of the others.
     """
     presets = presets or {}
-    points = score_table([*designs.values(), *presets.values()], speeds or {})
+    results = enumerate([*designs.values(), *presets.values()], 1)
+    points = score_table(dict(results), speeds or {})
     points["label"] = [f"{number}. {result.variant}" for number, result in points["result"].items()]
     points["design"] = pd.Series([*designs, *[None] * len(presets)], points.index, dtype=object)
     points["preset"] = [*[""] * len(designs), *presets]

@@ -122,7 +122,7 @@ def tradeoff(subject: str, request: Request) -> Path:
 def run_fits(search: Search) -> pd.DataFrame:
     """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
     own = max(1, search.base.settings["fit"].iterations)
-    rows: dict[int, Mapping[str, float | str]] = {}
+    rows: dict[int, Mapping[str, float]] = {}
     for steps in sorted({max(1, round(own * factor)) for factor in FACTORS}):
         variant = Variant(f"fit of {steps} steps", {"fit.iterations": str(steps)})
         seconds = search.results[()].seconds["fit"] * steps / own
@@ -215,11 +215,11 @@ def tables_of(study: Tradeoff) -> list[Table]:
     tables = [Table("tradeoff", f"What accuracy costs: {study.base.subject}", caption, rows)]
     if not study.fits.empty:
         told = (
-            f"Seconds ({' and '.join(sorted(set(study.fits['clock'])))}) of the registration alone. px: mean "
-            "distance of the trusted keypoints from where they were detected; mm: of the joints that the "
-            "camera sees from the truth, aligned at the neck."
+            "Seconds (processor) of the registration alone. px: mean distance of the trusted keypoints from "
+            "where they were detected; mm: of the joints that the camera sees from the truth, aligned at the "
+            "neck."
         )
-        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps").drop(columns="clock")
+        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps")
         tables.append(Table("fits", "What the fit's effort buys", told, fits, first="fit"))
     return tables
 
@@ -275,7 +275,7 @@ def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
     for label, result in study.points.loc[order, ["label", "result"]].itertuples(index=False):
         if result.folders.get("ingest") == study.points.loc[1, "result"].folders["ingest"]:
             train, remedy = result.folders["train"], "run the train stage again"
-            seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"].get("curve_seconds", [])}
+            seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"]["curve_seconds"]}
             line = read_curve(train / "curve.parquet", remedy).get("psnr", [])
             lines[label] = [(seconds[step], value) for step, value in line if step in seconds]
     return lines

@@ -135,7 +135,12 @@ class Base:
         self.log.parent.mkdir(parents=True, exist_ok=True)
         try:
             versions = make_results(self.job(variant.overrides), stages, self.log)
-            return read_result(self.subject, variant.name, {n: one.folder for n, one in versions.items()})
+            folders = {stage: version.folder for stage, version in versions.items()}
+            means = read_summary(folders["evaluate"])["means"] if "evaluate" in folders else {}
+            records = {stage: run_record(folder) for stage, folder in folders.items()}
+            seconds = {stage: record["seconds"] for stage, record in records.items()}
+            cpu = {stage: cpu_seconds(record) for stage, record in records.items()}
+            return Result(self.subject, variant.name, "", means, seconds, cpu, folders)
         except (UserError, OSError) as error:
             return Result(self.subject, variant.name, str(error))
 
@@ -169,23 +174,6 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     changed = any(not name.startswith("evaluate.") for name in own)
     full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
     return Base(subject, full, log, "" if changed else request.preset)
-
-
-def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Result:
-    """The scores and times that published versions hold.
-
-    Args:
-        subject, variant: names for the tables.
-        folders: stage -> its version.
-
-    Raises:
-        UserError: evaluate's file is damaged.
-    """
-    records = {stage: run_record(folder) for stage, folder in folders.items()}
-    means = read_summary(folders["evaluate"])["means"] if "evaluate" in folders else {}
-    seconds = {stage: record["seconds"] for stage, record in records.items()}
-    cpu = {stage: cpu_seconds(record) for stage, record in records.items()}
-    return Result(subject, variant, "", means, seconds, cpu, folders)
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
