@@ -20,7 +20,6 @@ from pipeline.config.evaluation_protocol import ON, chosen
 from pipeline.config.request import Request
 from pipeline.config.settings import as_dict, read_toml
 from pipeline.errors import UserError
-from pipeline.run.job import open_job
 from pipeline.run.progress import Progress
 from pipeline.store.artifact import read_manifest
 from pipeline.studies.measure import AvatarMeter, Numbers, score_table
@@ -103,7 +102,7 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
-                base = base_of(subject, request, folder / "log.txt", views_of(subject, request))
+                base = base_of(subject, request, folder / "log.txt", views=True)
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
@@ -123,12 +122,6 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     ablation = Ablation(scores.rename_axis(["subject", "variant"]), dataset_of(subjects, request), refined)
     write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
     return folder
-
-
-def views_of(subject: str, request: Request) -> Mapping[str, str]:
-    """The overrides that give the whole method generated views where its settings leave them out."""
-    auxiliary = open_job(subject, request).settings["auxiliary"]
-    return {"auxiliary.generator": "auto"} if auxiliary.generator == "off" else {}
 
 
 def variants_of(base: Base) -> dict[str, Variant]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -88,60 +89,59 @@ def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Meas
         subjects: all of it, the columns before the mean.
         found: subject -> what was measured, of those that have been run.
     """
-    published = {row.method: pd.DataFrame(row.values, list(SCORES), dtype=float) for row in about.rows}
-    for values in published.values():
-        if MEAN not in values and set(subjects) <= set(values):
-            values[MEAN] = values[list(subjects)].mean(axis=1)
-    said = [f"- {remark}" for remark in remarks(about, subjects, found)]
+    published: dict[str, dict[str, Sequence[float]]] = {row.method: dict(row.values) for row in about.rows}
+    for row in published.values():
+        if MEAN not in row and set(subjects) <= set(row):
+            row[MEAN] = pd.DataFrame(row)[list(subjects)].mean(axis=1).tolist()
     under = f", {about.table}" if about.table else ""
     head = f"# {about.title}\n\nPSNR (dB) / SSIM / LPIPS x 100{under}\n"
-    texts = method_texts(SCORES, subjects, published, found, counted(about))
-    lines = [head, pipe_table(texts, numbers="left"), "", *said, ""]
+    said = [f"- {remark}" for remark in remarks(about, subjects, found)]
+    lines = [head, *method_table(SCORES, subjects, published, found, counted(about)), *said, ""]
 
-    faces = {method: pd.DataFrame({MEAN: [cosine]}, list(FACES)) for method, cosine in about.faces.items()}
-    texts = method_texts(FACES, subjects, faces, found)
-    if len(texts):
+    cosines = {method: {MEAN: [cosine]} for method, cosine in about.faces.items()}
+    table = method_table(FACES, subjects, cosines, found)
+    if table:
         head = "## Face consistency\n\nThe cosine of ArcFace's embeddings of the rendered and the true face\n"
         unknown = ["- Not measured here: evaluate.arcface=FILE names ArcFace's ONNX file", ""]
-        lines += [head, pipe_table(texts, numbers="left"), "", *(unknown if len(texts) == len(faces) else [])]
+        known = any(FACES.keys() & of.keys() for one in found.values() for of in one.means.values())
+        lines += [head, *table, *([] if known else unknown)]
     return "\n".join(lines)
 
 
-def method_texts(
+def method_table(
     metrics: Mapping[str, tuple[int, float]],
     subjects: Sequence[str],
-    published: Mapping[str, pd.DataFrame],
+    published: Mapping[str, Mapping[str, Sequence[float]]],
     found: Mapping[str, Measured],
     marked: str = "",
-) -> pd.DataFrame:
-    """The cells of a table such as ``34.80 / 0.984 / 0.90``: a row a method of which a number is known.
+) -> list[str]:
+    """The lines of a table of ``34.80 / 0.984 / 0.90``: a row a method, a column a subject and their mean.
 
     Args:
         metrics: name -> digits after the point, and a factor of what was measured.
-        subjects: all of the dataset; those without a published or measured number have no column.
-        published: method -> a row a metric, a column a subject or the mean.
-        found: subject -> what was measured, of those that have been run.
+        subjects, found: as for ``comparison``.
+        published: method -> subject or mean -> a number a metric.
         marked: the method of ``OURS`` that stands out.
     """
-    rows = {f"{method} (published)": values for method, values in published.items()}
-    digits, factors = ([of[place] for of in metrics.values()] for place in (0, 1))
+    rows = {f"{method} (published)": row for method, row in published.items()}
     for method, name in OURS.items():
-        means = {subject: pd.Series(one.means.get(method, {}), dtype=float) for subject, one in found.items()}
-        ours = pd.DataFrame(means, list(metrics)).mul(factors, axis=0)
-        count = ours.notna().any().sum()
-        if count:
-            part = "" if count == len(subjects) else f" ({count} of {len(subjects)} subjects)"
-            shown = f"**{name}**" if method == marked else name
-            rows[f"{shown}{part}"] = ours.assign(**{MEAN: ours.mean(axis=1)})
-
-    def cell(numbers: pd.Series) -> str:
-        texts = ["-" if pd.isna(n) else f"{n:.{d}f}" for n, d in zip(numbers, digits, strict=True)]
-        return " / ".join(texts) if numbers.notna().any() else "-"
-
-    known = set().union(*rows.values())
-    columns = [*(subject for subject in subjects if subject in known), MEAN]
-    texts = {method: values.reindex(columns=columns).apply(cell) for method, values in rows.items()}
-    return pd.DataFrame.from_dict(texts, "index").rename_axis("method").reset_index()
+        ours = {
+            subject: [factor * one.means[method].get(key, math.nan) for key, (_, factor) in metrics.items()]
+            for subject, one in found.items()
+            if metrics.keys() & one.means.get(method, {}).keys()
+        }
+        if ours:
+            part = "" if len(ours) == len(subjects) else f" ({len(ours)} of {len(subjects)} subjects)"
+            name = f"**{name}**" if method == marked else name
+            rows[f"{name}{part}"] = {**ours, MEAN: pd.DataFrame(ours).mean(axis=1).tolist()}
+    digits = [digits for digits, _ in metrics.values()]
+    columns = [*(subject for subject in subjects if any(subject in row for row in rows.values())), MEAN]
+    texts = pd.DataFrame("-", pd.Index(rows, name="method"), columns)
+    for name, row in rows.items():
+        for column in row.keys() & set(columns):
+            cells = zip(row[column], digits, strict=True)
+            texts.loc[name, column] = " / ".join("-" if math.isnan(n) else f"{n:.{d}f}" for n, d in cells)
+    return [pipe_table(texts.reset_index(), numbers="left"), ""] if rows else []
 
 
 def counted(about: Dataset) -> str:

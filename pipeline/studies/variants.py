@@ -150,14 +150,14 @@ class Base:
         return dataclasses.replace(self, request=request, preset=preset)
 
 
-def base_of(subject: str, request: Request, log: Path, defaults: Overrides | None = None) -> Base:
+def base_of(subject: str, request: Request, log: Path, views: bool = False) -> Base:
     """A study's base: the request, on top of its scale, a lean evaluate and a curve of ten points.
 
     Args:
         subject: whose avatar.
         request: the command line's.
         log: a file for the stages' lines.
-        defaults: overrides that everything else wins over.
+        views: views are generated where the preset leaves them out.
 
     Raises:
         UserError: a setting or the scale is wrong.
@@ -171,8 +171,10 @@ def base_of(subject: str, request: Request, log: Path, defaults: Overrides | Non
     if train is not None:
         tenth = max(1, train.iterations // 10) if train.iterations else train.held_out_every
         lean["train.held_out_every"] = str(min(train.held_out_every, tenth))
+    if views and settings["auxiliary"].generator == "off":
+        lean["auxiliary.generator"] = "auto"
     changed = any(not name.startswith("evaluate.") for name in own)
-    full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
+    full = dataclasses.replace(request, overrides={**lean, **own})
     return Base(subject, full, log, "" if changed else request.preset)
 
 

@@ -85,7 +85,7 @@ def test_compare_puts_published_rows_beside_ours(many):
     )
     many.doit("subject=cat")
     latest = (many.store / "cat" / "paint" / "latest").resolve()
-    means = {"avatar": {"psnr": 28.125, "ssim": 0.9, "lpips_alex": 0.0123}}
+    means = {"avatar": {"psnr": 28.125, "ssim": 0.9, "lpips_alex": 0.0123, "arcface_cosine": None}}
     text = json.dumps({"means": {"test": means}, "protocol": "on black"})
     (latest / "summary.json").write_text(text)
     run = many.doit("compare", "dataset=one")
@@ -148,7 +148,7 @@ def test_datasets_are_judged_as_the_paper_does():
 
 def test_a_dataset_without_published_numbers_has_a_table_too():
     about = Dataset("x", "X", "", "", Layer("x", {}), "", ())
-    means = {"avatar": {"psnr": 20.0, "ssim": None, "lpips_alex": None}}
+    means = {"avatar": {"psnr": 20.0}}
     found = {"a": Measured(means)}
     shown = rows_of(comparison(about, ["a", "b"], found))
     assert shown["method"] == ["a", "mean"] and shown["**here** (1 of 2 subjects)"][0] == "20.00 / - / -"
