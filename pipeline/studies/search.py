@@ -1,40 +1,32 @@
-"""The designs of a tradeoff, made one after the other within a budget of seconds, and which nothing beats.
+"""The designs of a tradeoff, registrations and presets, made one after the other within a budget of seconds.
 
 Not a full grid: the base, then every level of every sweep parameter alone, then combinations of the levels
-that gained most for their time. A design is the tuple of levels that differ from the base; () is the base.
+that gained most for their time.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable
 
-import numpy as np
 import pandas as pd
 
 from pipeline.errors import UserError
-from pipeline.studies.measure import Numbers, score_table
-from pipeline.studies.sweep import CHANCE, Level
-from pipeline.studies.variants import Base, Result, Variant
-
-MOST_COMBINED = 6  # levels that combinations are made of: 15 pairs, 20 triples, ...
-
-Design = tuple[Level, ...]
-
-
-def label_of(design: Design) -> str:
-    """A design's name in tables."""
-    return ", ".join(level.label for level in design) or "base"
-
-
-def overrides_of(design: Design) -> dict[str, str]:
-    """The settings that a design sets on top of the base's."""
-    return {name: text for level in design for name, text in level.overrides.items()}
+from pipeline.run.job import Job
+from pipeline.studies.fit_error import FACTORS, fit_numbers
+from pipeline.studies.sweep import (
+    GAUSSIANS,
+    PRECISION,
+    REPRESENTATION,
+    Design,
+    Level,
+    label_of,
+    overrides_of,
+    setting_of,
+)
+from pipeline.studies.variants import Base, Result, Variant, run_record
 
 
 def seconds_of(text: str) -> float:
@@ -124,93 +116,54 @@ class Search:
         ratio = cost / max(self.results[()].training_cost, 1e-9)
         return ratio if 0 < ratio < math.inf else level.factor
 
+    def expected_cost(self, job: Job, levels: Iterable[Level]) -> float:
+        """Processor seconds that training under a job's settings would cost, from the levels tried alone.
 
-def point_table(
-    designs: Mapping[Design, Result],
-    presets: Mapping[str, Result] | None = None,
-    speeds: Mapping[Path, Numbers] | None = None,
-) -> pd.DataFrame:
-    """The points of a tradeoff, numbered from 1, in the order of their making.
+        Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
+        """
+        own, wanted, result = self.base.settings["train"], job.settings["train"], self.results[()]
+        cost = result.training_cost
+        marks = run_record(result.folders["train"])["timings"]["curve_seconds"] or [(1, 0.0, cost)]
+        done, _, iterating = marks[-1]  # the rest is spent before and after the steps
+        planned = done / own.effort if not own.iterations else done
+        cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
+        for level in levels:
+            if level.parameter in (GAUSSIANS, PRECISION, REPRESENTATION) and all(
+                str(setting_of(job.settings, name)).lower() == text for name, text in level.overrides.items()
+            ):
+                cost *= self.cost_ratio(level)
+        return cost
 
-    Args:
-        designs: the base's first.
-        presets: by name; they come last.
-        speeds: as ``AvatarMeter.speeds`` gives them.
+    def run_fits(self) -> pd.DataFrame:
+        """Steps -> ``fit_numbers`` of registrations, as far as a quarter of the budget reaches."""
+        own = max(1, self.base.settings["fit"].iterations)
+        rows: dict[int, dict[str, float]] = {}
+        for steps in sorted({max(1, round(own * factor)) for factor in FACTORS}):
+            variant = Variant(f"fit of {steps} steps", {"fit.iterations": str(steps)})
+            seconds = self.results[()].seconds["fit"] * steps / own
+            late = self.spent + seconds > self.budget / 4
+            if rows and late and self.base.missing("fit", variant.overrides):
+                print(f"{variant.name} is left out: the budget")
+                continue
+            result = self.base.run(variant, ["fit"])
+            if result.failure:
+                print(f"{variant.name} failed: {result.failure}")
+            else:
+                rows[steps] = fit_numbers(result, self.base.request.workspace.body_file)
+        return pd.DataFrame.from_dict(rows, orient="index")
 
-    Returns:
-        The columns of ``score_table``; ``label``, as ``1. base``; ``design``, None of a preset; ``preset``,
-        empty of others; ``times``, training cost over the base's; ``gain``, dB over the base; ``chance``,
-        true of another seed, which is no choice; and ``short``, dB under the frontier, of the others.
-    """
-    presets = presets or {}
-    results = enumerate([*designs.values(), *presets.values()], 1)
-    points = score_table(dict(results), speeds or {})
-    points["label"] = [f"{number}. {result.variant}" for number, result in points["result"].items()]
-    points["design"] = pd.Series([*designs, *[None] * len(presets)], points.index, dtype=object)
-    points["preset"] = [*[""] * len(designs), *presets]
-    points["chance"] = [bool(design) and design[0].parameter == CHANCE for design in points["design"]]
-    points["times"] = points["train_s"] / max(points["train_s"].iloc[0], 1e-9)
-    points["gain"] = points["psnr"] - points["psnr"].iloc[0]
-    choices = points[~points["chance"]]
-    points["short"] = shortfalls(choices["train_s"], choices["psnr"])
-    return points
-
-
-def noise_of(points: pd.DataFrame) -> float:
-    """How far another seed's PSNR is off, dB; NaN where none was reached."""
-    return points.loc[points["chance"], "gain"].abs().max()
-
-
-def combinations(points: pd.DataFrame) -> list[Design]:
-    """Pairs, then triples and more, of the levels that gained most for their time, the best first.
-
-    Levels count that gain more than chance does, and those that nothing beats, for they save time.
-
-    Args:
-        points: the base and what was tried so far, as ``point_table`` gives them.
-    """
-    noise = noise_of(points)
-    alone = points[~points["chance"] & points["design"].map(len).le(1)].dropna(subset=["gain", "times"])
-    unbeaten = alone.index.isin(frontier(alone["times"], alone["gain"]))
-    gaining = alone["gain"] > (noise if math.isfinite(noise) else 0.0)
-    kept = alone[(gaining | unbeaten) & alone["design"].map(bool)]
-    best = kept["design"][worth_of(kept).sort_values(kind="stable").index[::-1]][:MOST_COMBINED]
-    return [
-        tuple(levels)
-        for size in range(2, MOST_COMBINED + 1)
-        for levels in itertools.combinations(itertools.chain(*best), size)
-        if len({level.parameter for level in levels}) == size
-    ]
-
-
-def worth_of(points: pd.DataFrame) -> pd.Series:
-    """Quality gained for each e-fold of training time; a loss counts as it is.
-
-    Args:
-        points: ``gain``, dB over the base; ``times``, training time over the base's.
-    """
-    worth = points["gain"] / np.log(points["times"].clip(lower=1.02))
-    return worth.where(points["gain"] > 0, points["gain"])
-
-
-def frontier(costs: pd.Series, qualities: pd.Series) -> list[Any]:
-    """The labels of the points that no other dominates, the cheapest first.
-
-    A point dominates another if it costs no more and is no worse, and one of the two is strict. Of points
-    that are equal in both, the first one stands for all. Points with a number that is not finite never count.
-
-    Args:
-        costs: less is better.
-        qualities: more is better; of the same index.
-    """
-    points = pd.DataFrame({"cost": costs, "quality": qualities}).astype(float)
-    points = points[points.abs().lt(math.inf).all(axis=1)]
-    points = points.sort_values(["cost", "quality"], ascending=[True, False], kind="stable")
-    before = points["quality"].cummax().shift(fill_value=-math.inf)
-    return points.index[points["quality"] > before].tolist()
-
-
-def shortfalls(costs: pd.Series, qualities: pd.Series) -> pd.Series:
-    """The quality that each point lacks against the best of those that cost no more; 0 on the frontier."""
-    best = costs.map(lambda cost: qualities[costs <= cost].max())
-    return (best - qualities).clip(lower=0.0)
+    def run_presets(self, levels: Iterable[Level]) -> tuple[dict[str, Result], dict[str, float]]:
+        """The presets that the store holds or half of what is left reaches; the others' expected cost."""
+        own = self.results[()]
+        results, expected = {}, {}
+        for path in sorted((self.base.request.workspace.definitions("presets")).glob("*.toml")):
+            base = self.base.under_preset(path.stem)
+            cost = self.expected_cost(base.job(), levels)
+            seconds = cost * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
+            if seconds <= (self.budget - self.spent) / 2 or not base.missing("train", {}):
+                result = self.run(base, Variant(f"preset {path.stem}"))
+                if not result.failure:
+                    results[path.stem] = result
+                    continue
+            expected[path.stem] = cost
+        return results, expected

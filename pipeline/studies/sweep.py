@@ -35,6 +35,19 @@ class Level:
     factor: float = 1.0
 
 
+Design = tuple[Level, ...]
+
+
+def label_of(design: Design) -> str:
+    """A design's name in tables."""
+    return ", ".join(level.label for level in design) or "base"
+
+
+def overrides_of(design: Design) -> dict[str, str]:
+    """The settings that a design sets on top of the base's."""
+    return {name: text for level in design for name, text in level.overrides.items()}
+
+
 SCALED = (
     # parameter, its setting, factors, what the number is a multiple of, exponent of training time, in words
     ("steps", "train.iterations", (0.5, 2.0, 4.0), 1, 1.0, "{:,} iterations"),

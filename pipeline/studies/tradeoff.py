@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -12,33 +12,14 @@ import pandas as pd
 from pipeline.clip.curves import read_curve
 from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.run.job import Job
-from pipeline.studies.fit_error import FACTORS, fit_numbers
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import curves, scatter
+from pipeline.studies.points import combinations, frontier, noise_of, point_table, worth_of
 from pipeline.studies.report import Page, Picture, Section, publish
-from pipeline.studies.search import (
-    Search,
-    combinations,
-    frontier,
-    noise_of,
-    overrides_of,
-    point_table,
-    seconds_of,
-    spoken,
-    worth_of,
-)
-from pipeline.studies.sweep import (
-    GAUSSIANS,
-    PRECISION,
-    REPRESENTATION,
-    Level,
-    setting_of,
-    sizes_of,
-    sweep_levels,
-)
+from pipeline.studies.search import Search, seconds_of, spoken
+from pipeline.studies.sweep import GAUSSIANS, overrides_of, sizes_of, sweep_levels
 from pipeline.studies.tables import MAIN, NOTE, Table
-from pipeline.studies.variants import Base, Result, Variant, base_of, run_record
+from pipeline.studies.variants import Base, Result, base_of, run_record
 
 DEFAULT_BUDGET = "20m"
 COLUMNS = [
@@ -108,70 +89,15 @@ def tradeoff(subject: str, request: Request) -> Path:
     own = search.make(())
     if own.failure:
         raise UserError(own.failure)
-    fits = run_fits(search)
+    fits = search.run_fits()
     search.make_affordable((level,) for level in levels)
-    presets, expected = run_presets(search, levels)
+    presets, expected = search.run_presets(levels)
     search.make_affordable(combinations(point_table(search.results)))
     speeds = meters[0].speeds([*search.results.values(), *presets.values()])
     points = point_table(search.results, presets, speeds)
     points.loc[1, "preset"] = base.preset
     write_tradeoff(folder, Tradeoff(base, points, expected, fits, budget, search.spent))
     return folder
-
-
-def run_fits(search: Search) -> pd.DataFrame:
-    """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
-    own = max(1, search.base.settings["fit"].iterations)
-    rows: dict[int, Mapping[str, float]] = {}
-    for steps in sorted({max(1, round(own * factor)) for factor in FACTORS}):
-        variant = Variant(f"fit of {steps} steps", {"fit.iterations": str(steps)})
-        seconds = search.results[()].seconds["fit"] * steps / own
-        late = search.spent + seconds > search.budget / 4
-        if rows and late and search.base.missing("fit", variant.overrides):
-            print(f"{variant.name} is left out: the budget")
-            continue
-        result = search.base.run(variant, ["fit"])
-        if result.failure:
-            print(f"{variant.name} failed: {result.failure}")
-        else:
-            rows[steps] = fit_numbers(result, search.base.request.workspace.body_file)
-    return pd.DataFrame.from_dict(rows, orient="index")
-
-
-def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Result], dict[str, float]]:
-    """The presets that the store holds or half of the budget's rest reaches; the others' expected cost."""
-    own = search.results[()]
-    results, expected = {}, {}
-    for path in sorted((search.base.request.workspace.definitions("presets")).glob("*.toml")):
-        base = search.base.under_preset(path.stem)
-        cost = expected_cost(search, base.job(), levels)
-        seconds = cost * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
-        if seconds <= (search.budget - search.spent) / 2 or not base.missing("train", {}):
-            result = search.run(base, Variant(f"preset {path.stem}"))
-            if not result.failure:
-                results[path.stem] = result
-                continue
-        expected[path.stem] = cost
-    return results, expected
-
-
-def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
-    """Processor seconds that training under a job's settings would cost, from the levels tried alone.
-
-    Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
-    """
-    own, wanted, result = search.base.settings["train"], job.settings["train"], search.results[()]
-    cost = result.training_cost
-    marks = run_record(result.folders["train"])["timings"].get("curve_seconds") or [(1, 0.0, cost)]
-    done, iterating = float(marks[-1][0]), float(marks[-1][2])  # the rest is spent before and after the steps
-    planned = done / own.effort if not own.iterations else done
-    cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
-    for level in levels:
-        if level.parameter in (GAUSSIANS, PRECISION, REPRESENTATION) and all(
-            str(setting_of(job.settings, name)).lower() == text for name, text in level.overrides.items()
-        ):
-            cost *= search.cost_ratio(level)
-    return cost
 
 
 def write_tradeoff(folder: Path, study: Tradeoff) -> None:

@@ -8,17 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.studies.search import (
-    Search,
-    combinations,
-    frontier,
-    label_of,
-    noise_of,
-    overrides_of,
-    point_table,
-    shortfalls,
-)
-from pipeline.studies.sweep import CHANCE, Level
+from pipeline.studies.points import combinations, frontier, noise_of, point_table, shortfalls
+from pipeline.studies.search import Search
+from pipeline.studies.sweep import CHANCE, Level, label_of, overrides_of
 from pipeline.studies.variants import Result
 
 NUMBERS = st.floats(-100, 100) | st.just(math.nan)

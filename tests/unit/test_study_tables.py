@@ -32,9 +32,9 @@ from pipeline.studies.ablation import (
 from pipeline.studies.fit_error import aligned_error
 from pipeline.studies.measure import score_table
 from pipeline.studies.plots import bars, curves, round_ticks, scatter
-from pipeline.studies.search import label_of, point_table
+from pipeline.studies.points import point_table
 from pipeline.studies.sweep import CHANCE as CHANCE_PARAMETER
-from pipeline.studies.sweep import Level
+from pipeline.studies.sweep import Level, label_of
 from pipeline.studies.tables import LATEX, MAIN, METRICS, NOTE, Table, latex, markdown
 from pipeline.studies.tradeoff import Tradeoff, write_tradeoff
 from pipeline.studies.tradeoff import headline as pays
