@@ -120,7 +120,7 @@ FACTOR, GAIN = st.floats(0.3, 4.0), st.floats(-2, 2)
 FACTORS, GAINS = st.tuples(*[FACTOR] * len(LEVELS)), st.tuples(*[GAIN] * len(LEVELS))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(FACTORS, GAINS, st.floats(1, 5000), st.floats(0, 0.9))
 def test_a_study_starts_at_its_base_and_stays_within_its_budget(factors, gains, budget, surprise):
     world = World(factors, gains, surprise=surprise)
@@ -131,7 +131,7 @@ def test_a_study_starts_at_its_base_and_stays_within_its_budget(factors, gains, 
     assert world.now <= max(budget, 10 + world.train_seconds(())) + dearest + 1e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(FACTORS, GAINS)
 def test_with_time_enough_every_level_is_tried_alone_first_and_it_ends(factors, gains):
     made = World(factors, gains).search(1e9).results
@@ -142,7 +142,7 @@ def test_with_time_enough_every_level_is_tried_alone_first_and_it_ends(factors, 
         assert SEED not in design  # another seed combines with nothing
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(FACTORS, GAINS, st.integers(0, len(LEVELS)))
 def test_an_interrupted_study_goes_on_as_it_would_have(factors, gains, cut):
     whole = World(factors, gains)
