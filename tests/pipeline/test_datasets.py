@@ -10,6 +10,8 @@ from pipeline.config.settings import Layer
 from pipeline.config.subjects import load_subject
 from pipeline.config.workspace import open_workspace
 from pipeline.errors import UserError
+from pipeline.run.job import open_job
+from pipeline.run.process import make_results
 from pipeline.studies.compare import Measured, comparison, wanted
 
 
@@ -83,7 +85,7 @@ def test_compare_puts_published_rows_beside_ours(many):
         '[[paper.rows]]\nmethod = "Theirs"\ncat = [30.0, 0.9, 2.0]\ndog = [20.0, 0.8, 4.0]\n'
         '[[paper.rows]]\nmethod = "Others"\nmean = [31.0, 0.95, 1.5]\n'
     )
-    many.doit("subject=cat")
+    make_results(open_job("cat", many.request()))
     latest = (many.store / "cat" / "paint" / "latest").resolve()
     means = {"avatar": {"psnr": 28.125, "ssim": 0.9, "lpips_alex": 0.0123, "arcface_cosine": None}}
     text = json.dumps({"means": {"test": means}, "protocol": "on black"})
