@@ -98,7 +98,6 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     start, folder = time.monotonic(), request.workspace.data / "studies" / "ablate" / name
     bases: dict[str, Base] = {}
     results: dict[tuple[str, str], Result] = {}
-    speeds: dict[Path, Numbers] = {}
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
@@ -107,16 +106,18 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
                 continue
-            bases[subject], done = base, []
+            bases[subject] = base
             for key, variant in variants_of(base).items():
-                result = results[subject, key] = base.run(variant)
-                done += [] if result.failure else [result]
-                print(result.line, flush=True)
+                results[subject, key] = base.run(variant)
+                print(results[subject, key].line, flush=True)
                 progress.advance(1, variant.name)
-            if done:  # each subject's avatars are timed together
-                speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
     if all(result.failure for result in results.values()):
         raise UserError(next(iter(results.values())).failure)
+    speeds: dict[Path, Numbers] = {}
+    for subject, base in bases.items():  # each subject's avatars are timed together
+        done = [one for one in results.values() if one.subject == subject and not one.failure]
+        if done:
+            speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
     refined = all(counts_refined(base) for base in bases.values())
     scores = score_table(results, speeds, "avatar_refined" if refined else "avatar")
     ablation = Ablation(scores.rename_axis(["subject", "variant"]), dataset_of(subjects, request), refined)

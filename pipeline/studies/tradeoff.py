@@ -170,7 +170,8 @@ CURVES = (
 
 def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     """Draws every plot there is something for."""
-    pictures, points, fits = [], study.points.assign(base=study.points.index == 1), study.fits
+    pictures: list[Picture] = []
+    points, fits = study.points.assign(base=study.points.index == 1), study.fits
     for name, cost, metric, factor, across, up in PLOTS:
         file, shown = folder / f"{name}.png", points.assign(x=points[cost], y=factor * points[metric])
         expected = study.expected if cost == "train_s" else {}
