@@ -185,15 +185,15 @@ def compile_once(functions: tuple[str, ...]) -> None:
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself.
 
-    Beside it, the kernels of the stages after it are compiled where they never were, and the next stage loads
-    its code.
+    Beside it, the kernels of the stages after it are compiled where they never were, and their code is loaded.
     """
-    following = None
+    following: list[str] = []
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it
         asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
         compile_once(kernels_ahead(job_of(subject), asked, stage))
-        if len(CHOSEN) == 1 and stage in asked[:-1] and subject in CHOSEN:
-            following = asked[asked.index(stage) + 1]
+        if len(CHOSEN) == 1 and stage in asked and subject in CHOSEN:
+            later = asked[asked.index(stage) + 1 :]
+            following = [STAGES[one].run for one in later if job_of(subject).find(one) is None]
     reason = RUNNER.run(stage, subject, following)
     return TaskFailed(reason) if reason else None
 
