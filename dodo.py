@@ -25,7 +25,7 @@ import functools
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from doit import get_initial_workdir
@@ -194,8 +194,18 @@ def run_stage(stage: str, subject: str) -> TaskFailed | None:
         if len(CHOSEN) == 1 and stage in asked and subject in CHOSEN:
             later = asked[asked.index(stage) + 1 :]
             following = [STAGES[one].run for one in later if job_of(subject).find(one) is None]
-    reason = RUNNER.run(stage, subject, following)
+    with ended_in_silence():
+        reason = RUNNER.run(stage, subject, following)
     return TaskFailed(reason) if reason else None
+
+
+@contextlib.contextmanager
+def ended_in_silence() -> Iterator[None]:
+    """Whoever stops what runs within this by Ctrl-C gets the shell's exit status for it, and no traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
 
 
 def needed_assets(stage: str, subject: str) -> list[str]:
@@ -354,7 +364,8 @@ def run_studies(studies: Iterable[Callable[[Request], object]]) -> TaskFailed | 
     reasons = []
     for study in studies:
         try:
-            study(REQUEST)
+            with ended_in_silence():
+                study(REQUEST)
         except (UserError, OSError) as error:
             reasons.append(str(error))
     return TaskFailed("; ".join(reasons)) if reasons else None
