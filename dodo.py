@@ -185,7 +185,7 @@ def compile_once(functions: tuple[str, ...]) -> None:
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself.
 
-    Beside it, the kernels of the stages after it are compiled where they never were, and their code is loaded.
+    Beside it, the kernels of later stages are compiled where they never were, and their code is loaded.
     """
     following: list[str] = []
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it

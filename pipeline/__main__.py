@@ -7,7 +7,6 @@ same line works under any scheduler. ``python -m pipeline settings train`` lists
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
 from pipeline.errors import UserError, error_message
-from pipeline.run.job import entry_point, open_job, run_stage
+from pipeline.run.job import open_job, run_stage
 from pipeline.run.process import leave_reason
 from pipeline.run.stage import load_stages
 

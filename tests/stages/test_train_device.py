@@ -5,8 +5,8 @@ import importlib
 import pytest
 import torch
 
-from pipeline.avatar import holes, load_avatar
 from pipeline.avatar import head as heads
+from pipeline.avatar import holes, load_avatar
 from pipeline.avatar import skinning_tables as posing
 from pipeline.body import Pose
 from pipeline.clip import curves
