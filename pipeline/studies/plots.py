@@ -72,6 +72,7 @@ def scatter(
         axes.figure.legend(
             entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5
         )
+        assert isinstance(axes.figure, Figure)  # it is no part of another
         axes.figure.draw_without_rendering()  # places the axes, which labels are moved in
         labels = [
             axes.text(point["x"], point["y"], str(number), **NUMBERS[number in frontier])
