@@ -169,7 +169,7 @@ def test_a_body_seen_from_behind_alone_has_a_face_of_skin_and_cloth_in_front(seg
 def evidence(trust: torch.Tensor) -> Evidence:
     """Evidence of which trust is 0 or 1, as given."""
     count = len(trust)
-    return Evidence(trust, trust, trust, trust, torch.rand(count, 3), torch.zeros(count, 3))
+    return Evidence(trust, trust, trust, trust, trust, torch.rand(count, 3), torch.zeros(count, 3))
 
 
 @pytest.mark.parametrize("representation", ["bases", "triplane"])
