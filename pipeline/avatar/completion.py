@@ -30,10 +30,7 @@ from pipeline.texture.segments import SCALP, Segments, find_segments
 
 ARMS = 1.0  # radians that they hang down while holes are looked for
 FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
-LEAST_OWN, LEAST_OWN_HAIR = (
-    0.03,
-    0.15,
-)  # from its segment's colour, in [0, 1], seen from the edge
+LEAST_OWN = 0.06  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
 OWN, FREE = 1.0, 0.3  # distance more for a squared cosine of 1; from this one on any
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
