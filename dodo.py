@@ -25,7 +25,7 @@ import functools
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from doit import get_initial_workdir
@@ -185,17 +185,27 @@ def compile_once(functions: tuple[str, ...]) -> None:
 def run_stage(stage: str, subject: str) -> TaskFailed | None:
     """Runs a stage in a process of its own, which writes to this terminal itself.
 
-    Beside it, the kernels of the stages after it are compiled where they never were, and the next stage loads
-    its code.
+    Beside it, the kernels of later stages are compiled where they never were, and their code is loaded.
     """
-    following = None
+    following: list[str] = []
     with contextlib.suppress(UserError, OSError):  # the stage itself reports it
         asked = running(named_tasks(sys.argv[1:], STAGES) or (), STAGES)
         compile_once(kernels_ahead(job_of(subject), asked, stage))
-        if len(CHOSEN) == 1 and stage in asked[:-1] and subject in CHOSEN:
-            following = asked[asked.index(stage) + 1]
-    reason = RUNNER.run(stage, subject, following)
+        if len(CHOSEN) == 1 and stage in asked and subject in CHOSEN:
+            later = asked[asked.index(stage) + 1 :]
+            following = [STAGES[one].run for one in later if job_of(subject).find(one) is None]
+    with ended_in_silence():
+        reason = RUNNER.run(stage, subject, following)
     return TaskFailed(reason) if reason else None
+
+
+@contextlib.contextmanager
+def ended_in_silence() -> Iterator[None]:
+    """Whoever stops what runs within this by Ctrl-C gets the shell's exit status for it, and no traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
 
 
 def needed_assets(stage: str, subject: str) -> list[str]:
@@ -354,7 +364,8 @@ def run_studies(studies: Iterable[Callable[[Request], object]]) -> TaskFailed | 
     reasons = []
     for study in studies:
         try:
-            study(REQUEST)
+            with ended_in_silence():
+                study(REQUEST)
         except (UserError, OSError) as error:
             reasons.append(str(error))
     return TaskFailed("; ".join(reasons)) if reasons else None

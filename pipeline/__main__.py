@@ -7,7 +7,6 @@ same line works under any scheduler. ``python -m pipeline settings train`` lists
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import sys
 from pathlib import Path
@@ -15,8 +14,8 @@ from pathlib import Path
 from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
 from pipeline.errors import UserError, error_message
-from pipeline.run.job import entry_point, open_job, run_stage
-from pipeline.run.process import leave_reason, told_to_go_on
+from pipeline.run.job import open_job, run_stage
+from pipeline.run.process import leave_reason
 from pipeline.run.stage import load_stages
 
 
@@ -34,7 +33,6 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
         metavar="NAME=VALUE",
         help="as after 'doit run': preset=, source=, train.seed= ...",
     )
-    parser.add_argument("--waits", action="store_true", help=argparse.SUPPRESS)  # see StageProcess
     options = parser.parse_intermixed_args(arguments)
     if options.stage != "settings" and not options.subject:
         parser.error("a stage needs --subject NAME")
@@ -57,22 +55,11 @@ def print_settings(names: list[str]) -> int:
     return 0
 
 
-def ready(name: str) -> bool:
-    """Loads a stage's code, then waits; False where it is not needed after all."""
-    stage = load_stages().get(name)
-    if stage is not None:
-        with contextlib.suppress(Exception, KeyboardInterrupt):  # the stage itself will report it
-            entry_point(stage)
-    return told_to_go_on()
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Runs one stage; returns the exit status."""
     options = parse_arguments(sys.argv[1:] if arguments is None else arguments)
     if options.stage == "settings":
         return print_settings(options.words)
-    if options.waits and not ready(options.stage):
-        return 0
     where = Path.cwd()
     try:
         job = open_job(options.subject, parse_request(options.words, options.subject))

@@ -8,6 +8,7 @@ import pytest
 from pipeline.config.workspace import REPOSITORY
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # a worker a core is crowded; read when torch is loaded
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes are started that import the same
 if "PYTEST_XDIST_WORKER" in os.environ:  # a worker a core; tests that are about threads ask for two
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the processes that tests start
     import numba

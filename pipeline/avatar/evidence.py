@@ -32,7 +32,7 @@ from pipeline.avatar.surface import Surface
 from pipeline.body.mesh import face_normals, vertex_normals
 from pipeline.clip.camera import Camera, project, to_camera
 from pipeline.clip.views import View
-from pipeline.splat import Gaussians, render
+from pipeline.splat import Gaussians, picture_sums
 
 GRAZING, SQUARE = 0.0, 0.2  # cosines: nothing is learnt, all is learnt
 PERSON = 0.2, 0.7  # alpha: a pixel does not count, counts wholly
@@ -167,26 +167,17 @@ def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -
 
 
 def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Tensor, ...]:
-    """One frame's part in the sums of ``Evidence``: six of [N], colour times share and normals, [N, 3].
-
-    The blending weights come from the renderer's own backward pass: the derivative of
-    ``sum(rendering * picture)`` with respect to a Gaussian's colour is the sum of the pixels that it covers,
-    each times its blending weight there.
-    """
+    """One frame's part in the sums of ``Evidence``: six of [N], colour times share and normals, [N, 3]."""
     means = gaussians.means.detach()
     normals = vertex_normals(means, faces)
     covered = covered_pixels(view.camera, means, faces)
     towards = torch.nn.functional.normalize(view.camera.centre.to(means) - means, dim=1)
     cosine = (normals * towards).sum(1).clamp(0, 1)
-    weighed = dataclasses.replace(gaussians, colors=gaussians.colors.detach().clone().requires_grad_())
-    rendering = render(weighed, view.camera)
-    image = rendering.color
     counts = ramp(view.alpha, *PERSON)[..., None]
     if view.trust is not None:
         counts = counts * (view.trust >= LEAST_TRUST)[..., None]
-    color = torch.autograd.grad((image * view.color * counts).sum(), weighed.colors, retain_graph=True)[0]
-    weight = torch.autograd.grad((image[..., :1] * counts).sum(), weighed.colors)[0][:, :1]
-    own = torch.cat([weight, rendering.weights.to(weight)[:, None], covered[:, None], color], 1)
+    sums, weights = picture_sums(gaussians, view.camera, torch.cat([view.color * counts, counts], -1))
+    own = torch.cat([sums[:, 3:], weights[:, None], covered[:, None], sums[:, :3]], 1)
     around = pooled(own, faces)
     share = around[:, :2] / around[:, 2:3].clamp_min(SMALLEST)
     showed, shape = ramp(share[:, 0], HIDDEN, OPEN), ramp(share[:, 1], *PROTRUDES)

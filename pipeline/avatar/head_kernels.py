@@ -189,7 +189,10 @@ def norm_relu_backward(x, gradient, weight, bias, lanes, groups, to_x, y, sums):
     for chunk in numba.prange(CHUNKS):
         normal, push = np.empty(channels, np.float32), np.empty(channels, np.float32)
         inverse, along = np.empty(lanes, np.float32), np.empty(lanes, np.float32)
-        own = np.zeros((3, channels), np.float32)
+        own = np.empty((3, channels), np.float32)
+        for part in range(3):
+            for k in range(channels):
+                own[part, k] = np.float32(0)
         for row in range(chunk * step, min(rows, (chunk + 1) * step)):
             for k in range(channels):
                 normal[k] = load(x[row, k])
@@ -203,4 +206,6 @@ def norm_relu_backward(x, gradient, weight, bias, lanes, groups, to_x, y, sums):
             for k in range(channels):
                 own[2, k] += push[k]
                 to_x[row, k] = rounded(push[k], x[row, k])
-        sums[chunk] += own
+        for part in range(3):
+            for k in range(channels):
+                sums[chunk, part, k] += own[part, k]

@@ -10,8 +10,9 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Protocol
 
 from pipeline.config.request import Request
 from pipeline.config.workspace import REPOSITORY
@@ -24,86 +25,67 @@ REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
 
 CROWDED = 1.5  # running processes a core
-GO = b"go\n"
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 
-def stage_command(stage: str, subject: str, request: Request) -> list[str]:
-    """The command line of one stage."""
+class Starts(Protocol):
+    """Starts a stage, waits for it, and returns its exit status, negative where a signal ended it."""
+
+    def __call__(self, arguments: list[str], environment: Mapping[str, str], log: Path | None) -> int:
+        """See ``start_process`` for the arguments."""
+
+
+def stage_arguments(stage: str, subject: str, request: Request) -> list[str]:
+    """The arguments with which ``python -m pipeline`` runs one stage."""
     words = request.about(subject).words()
     words.pop("subject", None)
-    pairs = [f"{name}={value}" for name, value in words.items()]
+    return [stage, "--subject", subject, *(f"{name}={value}" for name, value in words.items())]
+
+
+def run_stage_process(
+    stage: str, subject: str, request: Request, log: Path | None = None, start: Starts | None = None
+) -> str | None:
+    """Runs a stage in a process that ends with this one; returns why it failed, None where it did not.
+
+    Args:
+        stage: its name.
+        subject: whose.
+        request: the command line's.
+        log: a file that gets the stage's lines in place of this terminal.
+        start: ``start_process`` if None.
+    """
+    with tempfile.TemporaryDirectory(prefix="flexiavatar-") as folder:
+        reason = Path(folder) / "reason"
+        arguments = stage_arguments(stage, subject, request)
+        status = (start or start_process)(arguments, {REASON: str(reason)}, log)
+        said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
+    if status < 0:
+        return killed_by(-status)
+    if status:
+        where = "its own lines above say why" if log is None else f"{log} says why"
+        return said or f"stopped with status {status}; {where}"
+    return None
+
+
+def start_process(arguments: list[str], environment: Mapping[str, str], log: Path | None) -> int:
+    """Runs a stage in a new Python; returns its exit status, negative where a signal ended it.
+
+    Args:
+        arguments: of ``stage_arguments``.
+        environment: variables besides those of this process.
+        log: a file that gets the stage's lines in place of this terminal.
+    """
     # -P: a folder called pipeline where the user stands is not taken for this package.
-    return [sys.executable, "-P", "-m", "pipeline", stage, "--subject", subject, *pairs]
-
-
-class StageProcess:
-    """A stage in a process that writes to this terminal and ends with this one."""
-
-    def __init__(
-        self, stage: str, subject: str, request: Request, log: Path | None = None, waits: bool = False
-    ):
-        """Starts it.
-
-        Args:
-            stage: its name.
-            subject: whose.
-            request: the command line's.
-            log: a file that gets the stage's lines in place of this terminal.
-            waits: it loads the stage's code, and waits for ``finish``.
-        """
-        self._folder = tempfile.TemporaryDirectory(prefix="flexiavatar-")
-        self._log, self._waits = log, waits
-        self._reason = Path(self._folder.name) / "reason"
-        command = [*stage_command(stage, subject, request), *(["--waits"] if waits else [])]
-        with contextlib.ExitStack() as stack:
-            out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
-            self._process = subprocess.Popen(
-                command,
-                env={**process_environment(), REASON: str(self._reason)},
-                stdin=subprocess.PIPE if waits else None,
-                stdout=out,
-                stderr=out,
-                preexec_fn=ending_with_this_process(),
-            )
-
-    def finish(self) -> str | None:
-        """Lets it go on if it waits; returns why it failed, in a line, and None where it did not."""
-        try:
-            with contextlib.suppress(BrokenPipeError):  # it has ended; its status says how
-                self._process.communicate(GO if self._waits else None)
-        except BaseException:
-            self._process.kill()
-            self._process.wait()
-            raise
-        said = self._reason.read_text(encoding="utf-8") if self._reason.is_file() else ""
-        self._folder.cleanup()
-        status = self._process.wait()
-        if status < 0:
-            return killed_by(-status)
-        if status:
-            where = "its own lines above say why" if self._log is None else f"{self._log} says why"
-            return said or f"stopped with status {status}; {where}"
-        return None
-
-    def close(self) -> None:
-        """Ends one that waits and is not needed; it may still be loading its code, which nobody waits for."""
-        self._process.kill()
-        self._process.communicate()
-        self._folder.cleanup()
-
-
-def told_to_go_on() -> bool:
-    """Waits for the word that ``StageProcess.finish`` sends; False where none will come."""
-    try:
-        return sys.stdin.buffer.readline() == GO
-    except (KeyboardInterrupt, ValueError):
-        return False
-
-
-def run_stage_process(stage: str, subject: str, request: Request, log: Path | None = None) -> str | None:
-    """Runs a stage as ``StageProcess``; returns why it failed, in a line, and None where it did not."""
-    return StageProcess(stage, subject, request, log).finish()
+    command = [sys.executable, "-P", "-m", "pipeline", *arguments]
+    with contextlib.ExitStack() as stack:
+        out = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
+        return subprocess.call(
+            command,
+            env={**process_environment(), **environment},
+            stdout=out,
+            stderr=out,
+            preexec_fn=ending_with_this_process(),
+        )
 
 
 def leave_reason(message: str) -> None:

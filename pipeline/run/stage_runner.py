@@ -1,21 +1,19 @@
-"""Stages one after the other, each with its code loaded while the one before it works.
-
-Loading a stage's code takes three to five seconds, most of it torch's, and one stage keeps one of two cores
-idle for most of its time.
-"""
+"""The stages of a subject, one after the other, with a loader's help where there is one."""
 
 from __future__ import annotations
 
 import atexit
-import os
-from collections.abc import Mapping
+import functools
+import threading
+from collections.abc import Mapping, Sequence
 
 from pipeline.config.request import Request
-from pipeline.run.process import StageProcess
+from pipeline.run.process import run_stage_process
+from pipeline.run.stage_loader import StageLoader, can_load_ahead
 
 
 class StageRunner:
-    """Runs the stages of one subject.
+    """Runs stages.
 
     Attributes:
         request: the command line's.
@@ -23,28 +21,33 @@ class StageRunner:
     """
 
     def __init__(self, request: Request, borrowed: Mapping[str, Request] | None = None):
-        """Starts nothing yet. What waits in the end is ended with this process."""
+        """Starts nothing yet."""
         self.request, self.borrowed = request, borrowed or {}
-        self._waiting: dict[tuple[str, str], StageProcess] = {}
+        self._loader: StageLoader | None = None
+        self._loader_is_taken = threading.Lock()
         atexit.register(self.close)
 
-    def run(self, stage: str, subject: str, following: str | None = None) -> str | None:
+    def run(self, stage: str, subject: str, following: Sequence[str] = ()) -> str | None:
         """Runs a stage; returns why it failed, in a line, and None where it did not.
 
         Args:
             stage: its name.
             subject: whose.
-            following: the stage that will be run after it, if one will.
+            following: ``Stage.run`` of the stages after it; their code is loaded meanwhile.
         """
-        process = self._waiting.pop((stage, subject), None)
-        if process is None:
-            process = StageProcess(stage, subject, self.borrowed.get(subject, self.request))
-        if following is not None and (os.cpu_count() or 1) > 1:
-            key = (following, subject)
-            self._waiting[key] = self._waiting.get(key) or StageProcess(*key, self.request, waits=True)
-        return process.finish()
+        run = functools.partial(run_stage_process, stage, subject, self.borrowed.get(subject, self.request))
+        loader = self._loader
+        if loader is None:
+            self._loader = StageLoader(following) if following and can_load_ahead() else None
+        elif loader.alive and self._loader_is_taken.acquire(blocking=False):
+            try:
+                return run(start=loader.run)
+            finally:
+                self._loader_is_taken.release()
+        return run()
 
     def close(self) -> None:
-        """Ends what waits."""
-        while self._waiting:
-            self._waiting.popitem()[1].close()
+        """Ends the loader."""
+        if self._loader is not None:
+            self._loader.close()
+        self._loader = None

@@ -2,6 +2,6 @@
 
 from pipeline.splat.gaussians import Gaussians, Rendering
 from pipeline.splat.ply import write_ply
-from pipeline.splat.render import render
+from pipeline.splat.render import picture_sums, render
 
-__all__ = ["Gaussians", "Rendering", "render", "write_ply"]
+__all__ = ["Gaussians", "Rendering", "picture_sums", "render", "write_ply"]

@@ -228,6 +228,65 @@ def sum_weights(slot_starts, slot_weights, weights):
 
 
 @kernel
+def _weigh(buffer, base, top, limits, sums):
+    """Draw the record at ``base`` of the buffer; ``sums`` [4] gets its weights times the picture's planes."""
+    zero, _, _, alpha_max, alpha_min, transmittance_min, _ = limits
+    mean_x, mean_y, xx, xy, yy, opacity, _, _, _, _ = _record(buffer, base)
+    first, end = _pixel_range(buffer, base, top)
+    s_red = s_green = s_blue = s_fourth = zero
+    for i in range(first, end):
+        t = buffer[_T + i]
+        dx, dy = buffer[_X + i] - mean_x, buffer[_Y + i] - mean_y
+        sigma = (xx * dx + xy * dy) * dx + yy * dy * dy
+        alpha = min(alpha_max, opacity * _exp_negative(sigma))
+        drawable = (t > zero) & (sigma >= zero) & (alpha >= alpha_min)
+        behind = t - t * alpha
+        drawn = drawable & (behind > transmittance_min)
+        ends = drawable & (behind <= transmittance_min)
+        weight = alpha * t if drawn else zero
+        s_red += weight * buffer[_R + i]
+        s_green += weight * buffer[_G + i]
+        s_blue += weight * buffer[_B + i]
+        s_fourth += weight * buffer[_D + i]
+        buffer[_T + i] = behind if drawn else (-t if ends else t)
+    sums[0], sums[1], sums[2], sums[3] = s_red, s_green, s_blue, s_fourth
+
+
+@parallel_kernel
+def blend_sums(order, tiles, columns, records, limits, member_weights, picture, slot_sums):
+    """Each tile's sums, for each of its Gaussians, of blending weight times a picture.
+
+    Args:
+        order, tiles, columns, records, limits: as given to ``blend_forward``.
+        member_weights: as ``blend_forward`` left them.
+        picture: [H, W, 4].
+        slot_sums: output [M, 4]; not written for a member without weight.
+    """
+    height, width = picture.shape[:2]
+    for q in prange(order.shape[0]):
+        tile = order[q]
+        first, stop = tiles.starts[tile], tiles.starts[tile + 1]
+        if first < stop:
+            top, left = tile // columns * TILE, tile % columns * TILE
+            tile_width, tile_height = min(width - left, TILE), min(height - top, TILE)
+            buffer, batch = np.empty(_FORWARD_SIZE, records.dtype), np.empty(_BATCH, np.int64)
+            _start_tile(buffer, tile_width, tile_height, limits)
+            for y in range(tile_height):
+                for x in range(tile_width):
+                    i = y * TILE + x
+                    buffer[int(_R) + i] = picture[top + y, left + x, 0]
+                    buffer[int(_G) + i] = picture[top + y, left + x, 1]
+                    buffer[int(_B) + i] = picture[top + y, left + x, 2]
+                    buffer[int(_D) + i] = picture[top + y, left + x, 3]
+            while first < stop:
+                count, first = _fetch_touched(
+                    records, tiles.members, member_weights, first, stop, left, top, buffer, batch
+                )
+                for k in range(count):
+                    _weigh(buffer, _base(k), top, limits, slot_sums[tiles.slots[batch[k]]])
+
+
+@kernel
 def _load_gradients(buffer, left, top, width, height, image, gradients):
     """Fill the backward pass's planes.
 

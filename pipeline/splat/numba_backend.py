@@ -15,7 +15,14 @@ from torch.autograd.function import once_differentiable
 
 from pipeline.clip.camera import Camera
 from pipeline.numba_kernels import use_torch_threads
-from pipeline.splat.blending import Limits, blend_backward, blend_forward, make_limits, sum_weights
+from pipeline.splat.blending import (
+    Limits,
+    blend_backward,
+    blend_forward,
+    blend_sums,
+    make_limits,
+    sum_weights,
+)
 from pipeline.splat.gaussians import Gaussians, Rendering
 from pipeline.splat.image_formation import Pinhole, make_pinhole
 from pipeline.splat.projection import (
@@ -38,6 +45,22 @@ def render_numba(gaussians: Gaussians, camera: Camera) -> Rendering:
     """
     lens = make_pinhole(_array(camera.intrinsics), camera.width, camera.height)
     return Rendering(*_Rasterize.apply(*gaussians.tensors(), camera.rotation, camera.translation, lens))
+
+
+def picture_sums_numba(gaussians: Gaussians, camera: Camera, picture: Tensor) -> tuple[Tensor, Tensor]:
+    """As ``render.picture_sums``, on the CPU, in one dtype."""
+    use_torch_threads()
+    lens = make_pinhole(_array(camera.intrinsics), camera.width, camera.height)
+    pose = _array(camera.rotation.double()), _array(camera.translation.double())
+    drawing = _draw([_array(tensor) for tensor in gaussians.tensors()], pose, lens)
+    slots = np.zeros((len(drawing.member_weights), 4), drawing.records.dtype)
+    blend_sums(
+        drawing.order, drawing.tiles, drawing.columns, drawing.records, drawing.limits,
+        drawing.member_weights, _array(picture), slots,
+    )  # fmt: skip
+    starts = torch.from_numpy(drawing.tiles.slot_starts).long()
+    sums = torch.segment_reduce(torch.from_numpy(slots), "sum", offsets=starts, initial=0)
+    return sums, torch.from_numpy(drawing.weights)
 
 
 @dataclasses.dataclass(frozen=True)

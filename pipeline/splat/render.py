@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
+from torch import Tensor
 
 from pipeline.clip.camera import Camera
 from pipeline.splat.gaussians import Gaussians, Rendering
@@ -66,3 +69,49 @@ def render(gaussians: Gaussians, camera: Camera, backend: str = "auto") -> Rende
     from pipeline.splat.dense import render_dense
 
     return render_dense(gaussians, camera)
+
+
+@torch.no_grad()
+def picture_sums(
+    gaussians: Gaussians,
+    camera: Camera,
+    picture: Tensor,  # [H, W, 4]
+) -> tuple[Tensor, Tensor]:
+    """The sums over the pixels of each Gaussian's blending weight times a picture, and of the weight alone.
+
+    Equal to ``plain_picture_sums``, in a third of its time on the CPU.
+
+    Args:
+        gaussians: N of them, in world coordinates.
+        camera: that looks.
+        picture: of the camera's size, on the Gaussians' device.
+
+    Returns:
+        [N, 4], and [N] as in ``Rendering.weights``.
+    """
+    if gaussians.means.device.type != "cpu":
+        return plain_picture_sums(gaussians, camera, picture)
+    from pipeline.splat.numba_backend import picture_sums_numba
+
+    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
+    return picture_sums_numba(gaussians.to(dtype), camera.to(device="cpu", dtype=dtype), picture.to(dtype))
+
+
+def plain_picture_sums(
+    gaussians: Gaussians,
+    camera: Camera,
+    picture: Tensor,  # [H, W, 4]
+) -> tuple[Tensor, Tensor]:
+    """What ``picture_sums`` means, by the renderer's backward pass.
+
+    The derivative of ``sum(rendering * picture)`` with respect to a Gaussian's colour is the sum of the
+    pixels that it covers, each times its blending weight there.
+    """
+    with torch.enable_grad():
+        weighed = dataclasses.replace(gaussians, colors=gaussians.colors.detach().clone().requires_grad_())
+        rendering = render(weighed, camera)
+        pictures = picture[..., :3], picture[..., 3:].expand(-1, -1, 3)
+        losses = [(rendering.color * one).sum() for one in pictures]
+        three = torch.autograd.grad(losses[0], weighed.colors, retain_graph=True)[0]
+        fourth = torch.autograd.grad(losses[1], weighed.colors)[0]
+    return torch.cat([three, fourth[:, :1]], 1), rendering.weights

@@ -138,13 +138,13 @@ class Silhouette:
         """Find the outlines of the body as it is posed now; arguments as for ``loss``, of all frames."""
         every = torch.arange(len(self.part))[None]
         with torch.no_grad():
-            found = []
+            found, at_rest = [], self._at_rest(parameters)
             for row in range(len(matrices)):
                 of_frame = parameters.rows(row, row + 1)
-                vertices = self._posed(of_frame, matrices[row : row + 1], every)[0]
+                vertices = self._posed(of_frame, matrices[row : row + 1], every, at_rest)[0]
                 found.append(self._outline(row, vertices))
             vertices, weight = (torch.stack(parts) for parts in zip(*found, strict=True))
-            distance = self._distance(self._posed(parameters, matrices, vertices), slice(None))
+            distance = self._distance(self._posed(parameters, matrices, vertices, at_rest), slice(None))
         clothes = segment_medians(-distance, self.segment[vertices], weight > 0)
         self.outlines = Outlines(vertices, weight, clothes)
 
@@ -161,14 +161,20 @@ class Silhouette:
         vertices, weight = self.outlines.vertices[rows], self.outlines.weight[rows]
         # A shoulder's outline would else swing an arm that nobody sees.
         matrices = torch.where(self.held[rows], matrices, matrices.detach())
-        distance = self._distance(self._posed(parameters, matrices, vertices), rows)
+        posed = self._posed(parameters, matrices, vertices, self._at_rest(parameters))
+        distance = self._distance(posed, rows)
         return (outline_loss(distance + self.outlines.clothes[rows], SATURATION) * weight).sum(1)
 
-    def _posed(self, parameters: Parameters, matrices: Tensor, vertices: Tensor) -> Tensor:
+    def _at_rest(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
+        """Vertices [V, 3] and joints [55, 3] of the T pose, metres; the same in every frame."""
+        rest = self.body.v_template + self.shape @ parameters.betas
+        return rest, self.body.joint_regressor @ rest + parameters.joint_offset
+
+    def _posed(
+        self, parameters: Parameters, matrices: Tensor, vertices: Tensor, at_rest: tuple[Tensor, Tensor]
+    ) -> Tensor:
         """Vertices of the body in the world, [T, P] -> [T, P, 3] metres."""
-        body = self.body
-        rest = body.v_template + self.shape @ parameters.betas
-        joints = body.joint_regressor @ rest + parameters.joint_offset
+        body, (rest, joints) = self.body, at_rest
         transforms, _ = forward_kinematics(matrices, joints, body.parents)
         blended = blend_transforms(transforms, body.skinning_weights[vertices])
         return transform_points(blended, rest[vertices]) + parameters.transl[:, None]

@@ -3,7 +3,11 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
+
+from pipeline.config.workspace import REPOSITORY
 
 
 def test_a_run_makes_every_stage_and_a_second_run_makes_none(toy):
@@ -162,6 +166,23 @@ def test_a_killed_stage_goes_on_where_it_was(toy):
     painted = (toy.store / "ann" / "paint" / "latest" / "painted.txt").read_text()
     assert painted == "ann 1.0" * 40
     assert not list((toy.store / "ann" / "paint").glob(".scratch-*"))
+
+
+def test_ctrl_c_ends_a_run_without_a_traceback_and_it_goes_on(toy):
+    words = ("subject=ann", "paint.iterations=60", "paint.rate=0.1")
+    line = [sys.executable, "-m", "doit", "run", *toy.words(), *words]
+    run = subprocess.Popen(
+        line, cwd=REPOSITORY, env=toy.environment(), start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    while not list((toy.store / "ann" / "paint").glob(".scratch-*/work/count.txt")):
+        assert run.poll() is None
+        time.sleep(0.05)
+    os.killpg(run.pid, signal.SIGINT)  # the terminal sends it to all
+    _, said = run.communicate(timeout=20)
+    assert run.returncode == 130 and "Traceback" not in said
+    assert "paint:ann stopped; the same command goes on from here" in said
+    assert toy.doit(*words[:1], "paint.iterations=60", "paint.rate=0.001").returncode == 0
 
 
 def test_two_runs_of_the_same_stage_at_once_make_one_version(toy):

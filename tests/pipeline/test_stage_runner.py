@@ -1,36 +1,69 @@
-"""Stages that load their code ahead: run when it is their turn, and gone when it never comes."""
+"""Stages whose code a loader has loaded: they run as any, and no process is left."""
+
+import os
+import subprocess
+import sys
+
+import pytest
 
 from pipeline.config.request import parse_request
-from pipeline.run.process import StageProcess
+from pipeline.run.process import run_stage_process
+from pipeline.run.stage_loader import StageLoader
 from pipeline.run.stage_runner import StageRunner
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loaders are of Linux")
+TOYS = tuple(f"tests.pipeline.toy_stages.work:{name}" for name in ("bend", "paint"))
 
 
 def request_of(toy, **words):
     return parse_request({"data": str(toy.data), "stages": "tests.pipeline.toy_stages", **words}, "ann")
 
 
-def test_a_waiting_stage_runs_when_told(toy):
-    waiting = StageProcess("gather", "ann", request_of(toy), waits=True)
-    assert toy.ran() == []
-    assert waiting.finish() is None and toy.ran() == ["gather:ann"]
+@pytest.fixture
+def loader():
+    loader = StageLoader(TOYS)
+    yield loader
+    loader.close()
+    assert not loader.alive
 
 
-def test_a_waiting_stage_that_is_not_needed_ends_and_does_nothing(toy, capfd):
-    waiting = StageProcess("gather", "ann", request_of(toy), waits=True)
-    waiting.close()
-    assert toy.ran() == []
-    assert capfd.readouterr() == ("", "")
+def test_stages_run_in_copies_of_the_loader(toy, loader):
+    for stage in ("gather", "bend", "paint"):
+        assert run_stage_process(stage, "ann", request_of(toy), start=loader.run) is None
+        assert toy.ran() == [f"{stage}:ann"]
+    painted = (toy.store / "ann" / "paint" / "latest" / "painted.txt").read_text()
+    assert painted == "ann 1.0" * 3
 
 
-def test_a_waiting_stage_says_why_it_failed(toy):
-    waiting = StageProcess("bend", "ann", request_of(toy), waits=True)
-    assert "doit run gather:ann" in waiting.finish()
+def test_a_stage_in_a_copy_says_why_it_failed(toy, loader):
+    assert "doit run gather:ann" in run_stage_process("bend", "ann", request_of(toy), start=loader.run)
+    words = {"bend.fail": "killed"}
+    assert run_stage_process("gather", "ann", request_of(toy), start=loader.run) is None
+    reason = run_stage_process("bend", "ann", request_of(toy, **words), start=loader.run)
+    assert "killed by signal 9" in reason
+    assert run_stage_process("bend", "ann", request_of(toy), start=loader.run) is None  # it goes on
 
 
-def test_stages_of_a_run_wait_for_their_turn_and_none_is_left(toy, monkeypatch):
+def test_lines_of_a_copy_go_where_those_of_a_process_go(toy, tmp_path, capfd):
+    loader, log = StageLoader(TOYS), tmp_path / "log.txt"
+    assert run_stage_process("gather", "ann", request_of(toy), log, loader.run) is None
+    assert "gather:ann done" in log.read_text() and capfd.readouterr() == ("", "")
+    assert run_stage_process("bend", "ann", request_of(toy), start=loader.run) is None
+    assert "bend:ann done" in capfd.readouterr().out
+    loader.close()
+
+
+def test_code_that_cannot_be_loaded_is_no_matter_until_it_is_needed(toy):
+    loader = StageLoader(["no.such.module:run"])
+    assert run_stage_process("gather", "ann", request_of(toy), start=loader.run) is None
+    loader.close()
+
+
+def test_a_loader_that_the_system_killed_is_done_without(toy, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     runner = StageRunner(request_of(toy))
-    assert runner.run("gather", "ann", "bend") is None and toy.ran() == ["gather:ann"]
-    assert runner.run("bend", "ann", "paint") is None and toy.ran() == ["bend:ann"]
+    assert runner.run("gather", "ann", TOYS) is None
+    mine = ["pkill", "-9", "-P", str(os.getpid()), "-f", "pipeline.run.stage_loader"]
+    subprocess.run(mine, check=True)
+    assert runner.run("bend", "ann", TOYS[1:]) is None and toy.ran() == ["gather:ann", "bend:ann"]
     runner.close()
-    assert toy.ran() == []

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.metrics import PSNR_CAP, Lpips, interior, psnr, ssim, ssim_loss
 from pipeline.metrics.face_identity import identity_cosine
@@ -53,6 +52,8 @@ def test_identical_images_score_best_and_pull_nowhere(pair):
 @pytest.mark.parametrize("pair", PAIRS)
 def test_the_score_is_that_of_double_precision_where_single_is_not_enough(pair):
     """Flat images: float32's variances are rounding. ``ssim`` scores in float64, the loss need not."""
+    from torchmetrics.functional.image import structural_similarity_index_measure  # takes 3 s
+
     image, truth = PAIRS[pair]
     batches = [one.double().permute(2, 0, 1)[None] for one in (image, truth)]
     exact = float(structural_similarity_index_measure(*batches, data_range=1.0))

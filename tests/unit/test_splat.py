@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from pipeline.clip.camera import Camera, facing_camera, project
-from pipeline.splat import Gaussians, render
+from pipeline.splat import Gaussians, picture_sums, render
+from pipeline.splat.render import plain_picture_sums
 from tests.made.splat_scene import NAMES, draw, images, leaves, scene
 
 
@@ -139,6 +140,17 @@ def test_weights_sum_to_alpha():
     rendering, _ = draw(*scene(100, 50, 50, seed=8), "numba")
     assert rendering.weights.sum().item() == pytest.approx(rendering.alpha.sum().item())
     assert not rendering.weights.requires_grad
+
+
+@pytest.mark.parametrize(("count", "width", "height", "size", "seed"), SCENES)
+def test_sums_over_a_picture_are_the_derivatives_of_the_rendering(count, width, height, size, seed):
+    gaussians, camera = scene(count, width, height, size=size, seed=seed)
+    picture = torch.rand(height, width, 4, generator=torch.Generator().manual_seed(1)).double()
+    sums, weights = picture_sums(gaussians, camera, picture)
+    plain, plain_weights = plain_picture_sums(gaussians, camera, picture)
+    assert torch.equal(weights, plain_weights) and (sums - plain).abs().max() <= 1e-12 * plain.abs().max()
+    single, _ = picture_sums(gaussians.to(torch.float32), camera, picture.float())
+    assert (single - plain).abs().max() <= 1e-4 * plain.abs().max()
 
 
 def test_one_and_two_threads_agree_to_the_bit():

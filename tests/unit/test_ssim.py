@@ -4,7 +4,6 @@ import numba
 import pytest
 import torch
 from skimage.metrics import structural_similarity
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from pipeline.metrics.ssim import gaussian_window, plain_ssim_loss, rounded_gaussian_window, ssim, ssim_loss
 from pipeline.numba_kernels import threads
@@ -32,6 +31,8 @@ def test_ssim_agrees_with_skimage(pair):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_ssim_is_torchmetrics_in_float64(pair, flat):
+    from torchmetrics.functional.image import structural_similarity_index_measure  # takes 3 s
+
     image, truth = pair
     if flat:
         image[:20], truth[:, :30] = 0.7, 0.4
@@ -80,6 +81,8 @@ def test_dissimilarity_is_one_minus_ssim_with_a_gradient_downhill(size):
 
 @pytest.mark.parametrize("size", [(11, 11), (24, 37)])
 def test_ssim_equals_torchmetrics_with_gradient(size):
+    from torchmetrics.functional.image import structural_similarity_index_measure  # takes 3 s
+
     target = drawn(*size, 3)
     image = (0.7 * target + 0.3 * drawn(*size, 3, seed=1)).requires_grad_()
     ours = ssim_loss(image, target)
