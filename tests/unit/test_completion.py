@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.avatar import Architecture, Avatar, load_avatar, save_avatar
 from pipeline.avatar.bake import bake
-from pipeline.avatar.completion import complete_avatar
+from pipeline.avatar.completion import LEAST_OWN, calm_colors, complete_avatar
 from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.holes import around_holes
 from pipeline.body import Pose, load_body, mean_identity, part_labels, rest_joints
@@ -211,6 +211,29 @@ def evidence(trust: torch.Tensor) -> Evidence:
     """Evidence of which trust is 0 or 1, as given."""
     count = len(trust)
     return Evidence(trust, trust, trust, trust, trust, torch.rand(count, 3), torch.zeros(count, 3))
+
+
+def test_what_frames_saw_from_its_edge_alone_stays_near_its_segments_color(segments):
+    avatar = trained("bases")
+    trust = torch.from_numpy(np.clip(4 * segments.normals[:, 2], 0, 1)).float()
+    shown = dataclasses.replace(evidence(trust), square=trust)
+    decoded, patch = avatar.decode(), segments.is_in(FACE, BODY) & (segments.normals[:, 2] < -0.1)
+    colors = torch.from_numpy(painted(segments)).float()
+    colors[torch.from_numpy(patch)] = torch.tensor([0.9, 0.2, 0.6])  # what stood behind the person's rim
+    low, high = calm_colors(dataclasses.replace(decoded, color_logit=torch.logit(colors)), shown)
+    base = avatar.base_color
+    square, scalp = trust > 0.5, torch.from_numpy(segments.is_in(SCALP))
+    assert low[square].max() == -torch.inf and high[square | scalp].min() == torch.inf
+    with torch.no_grad():
+        avatar.representation.color.copy_(torch.logit(colors) - base)
+        avatar.representation.hold_colors(low - base, high - base, (trust > 0).float())
+    found = torch.sigmoid(base + avatar.representation.color).detach().numpy()
+    for label, like in ((FACE, SKIN), (BODY, CLOTH)):
+        rows = patch & segments.is_in(label)
+        assert np.quantile(np.abs(found[rows] - like).max(1), 0.9) < 2 * LEAST_OWN
+    unseen = (trust == 0)[:, None].expand(-1, 3 * len(avatar.representation))
+    assert not avatar.representation.bases[:, : unseen.shape[1]][unseen].any()
+    assert avatar.representation.bases[:, unseen.shape[1] :].any()
 
 
 @pytest.mark.parametrize("representation", ["bases", "triplane"])
