@@ -141,15 +141,9 @@ class BasesRepresentation(Representation):
         self.bases[~seen] = 0.0
 
     @torch.no_grad()
-    def hold_colors(self, low: Tensor, high: Tensor, follows: Tensor) -> None:
-        """Keeps colours between two, [N, 3], logits as ``color`` has them.
-
-        Args:
-            low, high: the bounds.
-            follows: [N] in [0, 1], the share that is left of the bases of colour.
-        """
+    def hold_colors(self, low: Tensor, high: Tensor) -> None:
+        """Keeps colours between two, each [N, 3], logits as ``color`` has them."""
         self.color.clamp_(low, high)
-        self.bases[:, : 3 * len(self)] *= follows[:, None]
 
     @torch.no_grad()
     def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:

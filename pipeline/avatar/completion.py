@@ -26,12 +26,13 @@ from pipeline.avatar.surface import Surface
 from pipeline.body import Pose
 from pipeline.orbit_cameras import relaxed_pose
 from pipeline.texture.completion import color_field, complete_colors, complete_log_scales
-from pipeline.texture.segments import SCALP, Segments, find_segments
+from pipeline.texture.segments import Segments, find_segments
 
 ARMS = 1.0  # radians that they hang down while holes are looked for
 FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
-LEAST_OWN = 0.06  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
+LEAST_OWN = 0.12  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
 OWN, FREE = 1.0, 0.3  # distance more for a squared cosine of 1; from this one on any
+HAIR = 0.5  # share from which a place is hair
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
 
@@ -108,19 +109,18 @@ def calm_colors(decoded: Decoded, evidence: Evidence) -> tuple[Tensor, Tensor]:
     """Logits of the darkest and the brightest colour that evidence leaves each Gaussian, each [N, 3].
 
     Both lie about what its segment shows there, the nearer the less squarely frames saw it: what they saw
-    from its edge alone has the colours of whatever stands at that edge of the person. The scalp is free: a
-    few Gaussians there, beyond the horizon, make hair's soft rim.
+    from its edge alone has the colours of whatever stands at that edge of the person. Hair is free: a few
+    Gaussians there, beyond the horizon, make its soft rim.
     """
     none = torch.full_like(decoded.color_logit, torch.inf)
     color, telling, normals = _arrays(torch.sigmoid(decoded.color_logit), evidence.source, evidence.normals)
     if not (telling > 0).any():
         return -none, none
     segments = surface_segments(decoded.surface)
-    field = torch.from_numpy(color_field(segments, color, telling, normals)).to(none)
+    field, hair = (torch.from_numpy(one).to(none) for one in color_field(segments, color, telling, normals))
     around = (LEAST_OWN + OWN * evidence.square)[:, None]
     bounds = [torch.logit((field + side * around).clamp(DARKEST, BRIGHTEST)) for side in (-1, 1)]
-    hair = torch.from_numpy(segments.is_in(SCALP)).to(none.device)
-    free = (hair | (evidence.square > FREE))[:, None]
+    free = ((hair > HAIR) | (evidence.square > FREE))[:, None]
     return torch.where(free, -none, bounds[0]), torch.where(free, none, bounds[1])
 
 

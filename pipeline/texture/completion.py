@@ -88,7 +88,7 @@ def complete_colors(
     share = np.clip(trust, 0, 1)[:, None].astype(np.float64)
     if (share == 1).all():
         return np.asarray(color, np.float64).copy()
-    field = color_field(segments, color, telling, normals)
+    field, _ = color_field(segments, color, telling, normals)
     return np.where(share == 1, color, share * np.where(share > 0, color, 0) + (1 - share) * field)
 
 
@@ -97,10 +97,11 @@ def color_field(
     color: np.ndarray,  # [N, 3]
     telling: np.ndarray,  # [N]
     normals: np.ndarray | None = None,  # [N, 3]
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """The colour that each vertex has by what others of its kind show, calm and without grain: [N, 3].
 
-    The arguments are those of ``complete_colors``; some vertex tells something.
+    The arguments are those of ``complete_colors``; some vertex tells something. The second value is how
+    likely each is hair, [N] in [0, 1].
     """
     shade = np.ones((len(segments), 1))
     source = spreading(segments, color, telling)
@@ -108,9 +109,9 @@ def color_field(
         shade = np.exp(shading(color, source, normals, segments.part))[:, None]
     flat = color / shade
     head = head_field(segments, flat, telling)
-    field = np.empty_like(flat)
+    field, hair = np.empty_like(flat), segments.is_in(SCALP).astype(np.float64)
     if head is not None:
-        field[segments.is_in(*HEAD)] = head
+        field[segments.is_in(*HEAD)], hair[segments.is_in(*HEAD)] = head
     rows = np.flatnonzero(np.ones(len(segments)) if head is None else ~segments.is_in(*HEAD))
     reach = np.array([REACH.get(label, REACH[BODY]) for label in range(segments.label.max() + 1)])
     guessed = guess(segments, flat, source)[rows]
@@ -118,7 +119,7 @@ def color_field(
     field[rows] = bent(
         links, guessed, flat[rows], source[rows], segments.spacing[rows], reach[segments.label[rows]]
     )
-    return np.clip(field * shade, 0, 1)
+    return np.clip(field * shade, 0, 1), hair
 
 
 def bent(
@@ -148,8 +149,12 @@ def bent(
     return guessed + moved
 
 
-def head_field(segments: Segments, flat: np.ndarray, telling: np.ndarray) -> np.ndarray | None:
-    """The colours of face, scalp and neck, mixed of hair and skin, [M, 3]; None where it shows but one.
+def head_field(
+    segments: Segments, flat: np.ndarray, telling: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The colours of face, scalp and neck, mixed of hair and skin, [M, 3], and the share of hair, [M].
+
+    None where the head shows but one of the two.
 
     Args:
         segments: of the surface.
@@ -175,7 +180,7 @@ def head_field(segments: Segments, flat: np.ndarray, telling: np.ndarray) -> np.
         guessed = known * flat[mirrored] + (1 - known) * tone
         reach = np.full(len(rows), HEAD_REACH)
         fields.append(bent(links, guessed, flat[rows], source[rows], segments.spacing[rows], reach))
-    return fields[0] + share[:, None] * (fields[1] - fields[0])
+    return fields[0] + share[:, None] * (fields[1] - fields[0]), share
 
 
 def head_tones(segments: Segments, flat: np.ndarray, telling: np.ndarray) -> np.ndarray | None:

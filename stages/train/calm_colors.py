@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from pipeline.avatar.bases_representation import BasesRepresentation
 from pipeline.avatar.completion import calm_colors
-from pipeline.avatar.evidence import FRONTAL, ramp
 from pipeline.clip.frames import spread_from_start
 from stages.train.frame_evidence import evidence_of
 from stages.train.loop import Hook, Trainer
@@ -29,12 +28,10 @@ class CalmColors(nn.Module, Hook):
 
     Attributes:
         low, high: [N, 3], the bounds of what is added to the base colour, logits.
-        follows: [N], what each step leaves of what follows the pose.
     """
 
     low: Tensor  # [N, 3]
     high: Tensor  # [N, 3]
-    follows: Tensor  # [N]
 
     def __init__(self, base_color: Tensor, first: int):
         """Holds nothing yet.
@@ -47,7 +44,6 @@ class CalmColors(nn.Module, Hook):
         self._first = first
         self.register_buffer("low", torch.full_like(base_color, -LARGEST))
         self.register_buffer("high", torch.full_like(base_color, LARGEST))
-        self.register_buffer("follows", torch.ones_like(base_color[:, 0]))
 
     def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
         """Looks once what is seen weakly, then holds its colours after every step."""
@@ -55,7 +51,7 @@ class CalmColors(nn.Module, Hook):
             self._look(trainer)
         representation = trainer.avatar.representation
         if trainer.iteration >= self._first and isinstance(representation, BasesRepresentation):
-            representation.hold_colors(self.low, self.high, self.follows)
+            representation.hold_colors(self.low, self.high)
 
     def _look(self, trainer: Trainer) -> None:
         avatar, data, count = trainer.avatar.eval(), trainer.data, trainer.settings.color_frames // EVERY
@@ -67,5 +63,4 @@ class CalmColors(nn.Module, Hook):
         for kept, bound in zip((self.low, self.high), calm_colors(decoded, evidence), strict=True):
             away = (bound - avatar.base_color[rows]).clamp(-LARGEST, LARGEST)
             kept.index_copy_(0, rows, away)
-        self.follows.index_copy_(0, rows, ramp(evidence.square, *FRONTAL))
         avatar.train()

@@ -251,7 +251,7 @@ class TrainSettings:
         10.0, "times more that smoothness counts where no frame showed enough, continuously"
     )
     calm_from: Fraction = setting(
-        0.4,
+        0.2,
         "fraction of the run from which colours of surface that frames saw from its edge alone are held to "
         "its segment's; 1: never",
     )
