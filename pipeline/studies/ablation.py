@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -17,17 +16,18 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.config.evaluation_protocol import ON, chosen
 from pipeline.config.request import Request
-from pipeline.config.settings import read_toml
+from pipeline.config.settings import as_dict, read_toml
 from pipeline.errors import UserError
-from pipeline.run.job import open_job
 from pipeline.run.progress import Progress
 from pipeline.store.artifact import read_manifest
 from pipeline.studies.measure import AvatarMeter, Numbers, score_table
 from pipeline.studies.plots import bars
-from pipeline.studies.report import Page, Section, closing_sections, publish, sizes_of, study_folder
-from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, REGIONS, RUNTIME, Table
-from pipeline.studies.variants import Base, Result, Variant, another_seed, base_of, scale_overrides
+from pipeline.studies.report import Page, Section, publish
+from pipeline.studies.sweep import sizes_of
+from pipeline.studies.tables import HERE, IMAGE, MAIN, MEAN, METRICS, NOTE, PAPER, Table
+from pipeline.studies.variants import Base, Result, Variant, another_seed, base_of
 
 FULL, CHANCE = "full", "chance"
 FIXED = 0.4  # the paper's threshold by hand
@@ -48,19 +48,7 @@ VARIANTS: Mapping[str, Variant] = {
 
 LABELS = {**{key: variant.name for key, variant in VARIANTS.items()}, CHANCE: "another seed"}
 
-COLUMNS: Mapping[str, Sequence[str]] = {"runtime": list(RUNTIME), "regions": list(REGIONS)}
-CAPTIONS = {
-    "runtime": "Processor milliseconds of one thread, the least of 15 frames of the baked avatar in held-out "
-    "poses, drawn at 512×512; asset: mean, opacity, scale, rotation and colour in float32.",
-    "regions": "Means over held-out frames of square crops around face and hands.",
-}
 SAME = "the very same avatar as full: here it changes nothing"
-CHANCE_TABLE = {
-    "name": "chance",
-    "title": "What chance is worth: the whole method with another seed",
-    "kind": "chance",
-    "rows": [{"variant": FULL}, {"variant": CHANCE}],
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,28 +56,19 @@ class Ablation:
     """The results of an ablation.
 
     Attributes:
-        results: (subject, key of the variant) -> result.
-        speeds: as ``AvatarMeter.speeds`` gives them.
+        scores: as ``score_table`` gives them, indexed by ``subject`` and ``variant``, the variant's key.
         dataset: the one that all subjects belong to; empty if none.
         refined: whether the scores are those with held-out poses refined, as on NeuMan.
     """
 
-    results: Mapping[tuple[str, str], Result]
-    speeds: Mapping[Path, Numbers]
+    scores: pd.DataFrame
     dataset: str = ""
     refined: bool = False
-
-    @functools.cached_property
-    def scores(self) -> pd.DataFrame:
-        """A row a result, indexed like the results; columns as in ``score_table``."""
-        method = "avatar_refined" if self.refined else "avatar"
-        index = pd.MultiIndex.from_tuples(list(self.results), names=["subject", "variant"])
-        return score_table(list(self.results.values()), self.speeds, method).set_axis(index)
 
     @property
     def subjects(self) -> list[str]:
         """Whose avatars."""
-        return list(dict.fromkeys(subject for subject, _ in self.results))
+        return self.scores.index.unique("subject").tolist()
 
     def gains(self, metric: str) -> pd.Series:
         """Key of a variant -> its mean difference from the whole method, over the subjects that have both.
@@ -103,7 +82,7 @@ class Ablation:
 
 
 def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
-    """Runs every variant of the subjects and writes tables, plots and page.
+    """Runs every variant of the subjects, one after the other, and writes tables, plots and page.
 
     Args:
         name: of the study: a subject, or a dataset.
@@ -116,53 +95,34 @@ def ablate(name: str, subjects: Sequence[str], request: Request) -> Path:
     Raises:
         UserError: a setting is wrong, or nothing at all could be made.
     """
-    scale_overrides(request)  # refused before anything is made
-    start, folder = time.monotonic(), study_folder(request.workspace.data, "ablate", name)
-    bases, results = run_all(subjects, request, folder / "log.txt")
-    if all(result.failure for result in results.values()):
-        raise UserError(next(iter(results.values())).failure)
-    refined = all(counts_refined(base) for base in bases.values())
-    speeds = speeds_of(bases, results)
-    ablation = Ablation(results, speeds, dataset_of(subjects, request), refined)
-    write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
-    return folder
-
-
-def run_all(
-    subjects: Sequence[str], request: Request, log: Path
-) -> tuple[dict[str, Base], dict[tuple[str, str], Result]]:
-    """Every variant of every subject, a subject after the other; and the bases that could be read."""
+    start, folder = time.monotonic(), request.workspace.data / "studies" / "ablate" / name
     bases: dict[str, Base] = {}
     results: dict[tuple[str, str], Result] = {}
     with contextlib.closing(Progress(len(subjects) * len(LABELS), "ablate")) as progress:
         for subject in subjects:
             try:
-                bases[subject] = base_of(subject, request, log, views_of(subject, request))
+                base = base_of(subject, request, folder / "log.txt", views=True)
             except UserError as error:
                 results |= {(subject, key): Result(subject, key, str(error)) for key in LABELS}
                 progress.advance(len(LABELS), subject)
                 continue
-            for key, variant in variants_of(bases[subject]).items():
-                results[subject, key] = bases[subject].run(variant)
+            bases[subject] = base
+            for key, variant in variants_of(base).items():
+                results[subject, key] = base.run(variant)
                 print(results[subject, key].line, flush=True)
                 progress.advance(1, variant.name)
-    return bases, results
-
-
-def views_of(subject: str, request: Request) -> Mapping[str, str]:
-    """The overrides that give the whole method generated views where its settings leave them out."""
-    auxiliary = open_job(subject, request).settings["auxiliary"]
-    return {"auxiliary.generator": "auto"} if auxiliary.generator == "off" else {}
-
-
-def speeds_of(bases: Mapping[str, Base], results: Mapping[tuple[str, str], Result]) -> dict[Path, Numbers]:
-    """The numbers of ``AvatarMeter.speeds`` of all results; each subject's avatars are timed together."""
+    if all(result.failure for result in results.values()):
+        raise UserError(next(iter(results.values())).failure)
     speeds: dict[Path, Numbers] = {}
-    for subject, base in bases.items():
+    for subject, base in bases.items():  # each subject's avatars are timed together
         done = [one for one in results.values() if one.subject == subject and not one.failure]
         if done:
             speeds |= AvatarMeter(base.job(), done[0].folders["ingest"]).speeds(done)
-    return speeds
+    refined = all(counts_refined(base) for base in bases.values())
+    scores = score_table(results, speeds, "avatar_refined" if refined else "avatar")
+    ablation = Ablation(scores.rename_axis(["subject", "variant"]), dataset_of(subjects, request), refined)
+    write_ablation(folder, name, ablation, next(iter(bases.values())), time.monotonic() - start)
+    return folder
 
 
 def variants_of(base: Base) -> dict[str, Variant]:
@@ -179,8 +139,7 @@ def dataset_of(subjects: Sequence[str], request: Request) -> str:
 
 def counts_refined(base: Base) -> bool:
     """Whether the settings ask for scores with held-out poses refined, as the paper has them on NeuMan."""
-    evaluate = base.settings["evaluate"]
-    return evaluate.refine_test_poses == "on" or getattr(evaluate, "protocol", "") == "paper"
+    return chosen(as_dict(base.settings["evaluate"])).refine_test_poses == ON
 
 
 def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
@@ -190,11 +149,10 @@ def tables_of(ablation: Ablation, sizes: str) -> list[Table]:
     """
     noise = ablation.gains("psnr")[CHANCE]
     chance = f" Another seed differs by {noise:.2f} dB." if math.isfinite(noise) else ""
-    described = [*read_toml(Path(__file__).with_name("paper.toml"))["tables"], CHANCE_TABLE]
     return [
         table_of(about, ablation, f"Sizes: {sizes}.{chance}")
-        for about in described
-        if ablation.scores[COLUMNS.get(about.get("kind", ""), list(IMAGE))].notna().any(axis=None)
+        for about in read_toml(Path(__file__).with_name("paper.toml"))["tables"]
+        if ablation.scores[about.get("columns", list(IMAGE))].notna().any(axis=None)
     ]
 
 
@@ -206,8 +164,7 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, remark: str) -> Table
         ablation: its results.
         remark: ends the caption.
     """
-    kind, wanted = about.get("kind", ""), [row["variant"] for row in about["rows"]]
-    keys = COLUMNS.get(kind, list(IMAGE))
+    keys, wanted = about.get("columns", list(IMAGE)), [row["variant"] for row in about["rows"]]
     factors = [METRICS[key].factor for key in keys]
     present = ablation.scores["psnr"].unstack()[wanted].notna().all(axis=1)
     counted = [subject for subject in ablation.subjects if present[subject]] or ablation.subjects
@@ -224,19 +181,17 @@ def table_of(about: Mapping[str, Any], ablation: Ablation, remark: str) -> Table
             published = pd.DataFrame([row["values"]], [row["label"]], keys) / factors
             rows.append(published.assign(**{NOTE: "published, on another machine", MAIN: False}))
     poses = ", poses refined on them" if ablation.refined else ""
-    caption = CAPTIONS.get(kind, f"Means over held-out frames{poses}.")
-    table = pd.concat(rows).rename_axis(None)
-    return Table(about["name"], about["title"], f"{caption} {remark}", table, ranked=kind != "chance")
+    caption = f"{about.get('caption', f'Means over held-out frames{poses}.')} {remark}"
+    table, ranked = pd.concat(rows).rename_axis(None), about.get("ranked", True)
+    return Table(about["name"], about["title"], caption, table, ranked=ranked)
 
 
 def note_on(key: str, ablation: Ablation, counted: Sequence[str]) -> str:
     """The remarks on a row: who failed, whose avatar is full's own, how many subjects it is a mean of."""
     notes, count = [], len(ablation.subjects)
     for subject in ablation.subjects:
-        of, one, full = (
-            f" ({subject})" if count > 1 else "",
-            *(ablation.results[subject, k] for k in (key, FULL)),
-        )
+        of = f" ({subject})" if count > 1 else ""
+        one, full = (ablation.scores.loc[(subject, name), "result"] for name in (key, FULL))
         if one.failure:
             notes.append(f"failed{of}: {one.failure}")
         elif key not in (FULL, CHANCE) and not full.failure and avatar_digest(one) == avatar_digest(full):
@@ -256,9 +211,9 @@ def values_of(tables: Sequence[Table], ablation: Ablation) -> pd.DataFrame:
     several = len(ablation.subjects) > 1
     values = [table.values(MEAN if several else ablation.subjects[0]) for table in tables]
     if several:
-        own = ablation.scores[[*IMAGE, *RUNTIME, *REGIONS]].rename_axis(columns="metric")
-        own = own.stack().rename("value").reset_index()
-        own = own.assign(table="each subject", row=own["variant"].map(LABELS), source=HERE).dropna()
+        own = ablation.scores[list(dict.fromkeys(key for table in tables for key in table.numbers))]
+        own = own.rename_axis(columns="metric").stack().rename("value").reset_index().dropna()
+        own = own.assign(table="each subject", row=own["variant"].map(LABELS), source=HERE)
         values.append(own[values[0].columns])
     return pd.concat(values, ignore_index=True)
 
@@ -280,15 +235,12 @@ def write_ablation(folder: Path, name: str, ablation: Ablation, base: Base, seco
         pictures.append((folder / file, f"{label}; grey: by how much another seed differs."))
     several = len(ablation.subjects) > 1
     tables = tables_of(ablation, sizes_of(base.settings))
-    changed = {one.name: one.overrides for one in variants_of(base).values()}
-    results = {f"{o.subject}, {o.variant}" if several else o.variant: o for o in ablation.results.values()}
-    sections = [
-        Section("At a glance", pictures=pictures),
-        Section("The paper's tables", tables=tables),
-        *closing_sections(base, changed, results, seconds),
-    ]
+    sections = [Section("At a glance", pictures=pictures), Section("The paper's tables", tables=tables)]
     lines = [f"Subjects: {', '.join(ablation.subjects)}."] if several else []
-    page = Page(f"{name}: what each part is worth", headline(ablation), lines, sections)
+    changed = {one.name: one.overrides for one in variants_of(base).values()}
+    results = {f"{o.subject}, {o.variant}" if several else o.variant: o for o in ablation.scores["result"]}
+    title = f"{name}: what each part is worth"
+    page = Page(title, headline(ablation), lines, sections, base, changed, results, seconds)
     publish(folder, page, values_of(tables, ablation))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -17,10 +18,10 @@ from pipeline.run.stage import usual
 from pipeline.store.artifact import Store
 from pipeline.store.digest import write_atomically
 from pipeline.studies.tables import MEAN, pipe_table
-from pipeline.studies.variants import held_out_means, read_summary
+from pipeline.studies.variants import read_summary
 
-DIGITS = {"psnr": 2, "ssim": 3, "lpips_alex": 2}
-FACES = "arcface_cosine"
+SCORES = {"psnr": (2, 1), "ssim": (3, 1), "lpips_alex": (2, 100)}  # digits after the point, and a factor
+FACES = {"arcface_cosine": (4, 1)}
 AVATAR, REFINED = "avatar", "avatar_refined"
 OURS = {
     AVATAR: "here",
@@ -34,12 +35,12 @@ class Measured:
     """One subject's result.
 
     Attributes:
-        means: method -> metric -> mean over the held-out frames, None where it has none.
+        means: method -> metric -> mean over the held-out frames, of the metrics that have one.
         protocol, background, render_mask: how it was measured.
         current: whether it was made under the settings that are asked for.
     """
 
-    means: Mapping[str, Mapping[str, float | None]]
+    means: Mapping[str, Mapping[str, float]]
     protocol: str = ""
     background: str = "black"
     render_mask: str = OWN
@@ -77,71 +78,70 @@ def measured_of(subject: str, request: Request) -> Measured | None:
     summary = read_summary(artifact.folder)
     mask = summary.get("choices", {}).get("render_mask", OWN)
     protocol, background = str(summary.get("protocol", "")), str(summary.get("background", "black"))
-    return Measured(held_out_means(summary), protocol, background, str(mask), current=current is not None)
+    return Measured(summary["means"], protocol, background, str(mask), current=current is not None)
 
 
 def comparison(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> str:
-    """The table as Markdown, with remarks below.
+    """The table as Markdown, with remarks below, and a table of face consistency where any is known.
 
     Args:
         about: the dataset, with the published rows.
         subjects: all of it, the columns before the mean.
         found: subject -> what was measured, of those that have been run.
     """
-    published = {column for row in about.rows for column in row.values}
-    columns = [*(subject for subject in subjects if subject in published or subject in found), MEAN]
-    rows = {f"{row.method} (published)": scores(row.values, subjects) for row in about.rows}
-    for method, name in OURS.items():
-        means = {subject: one.means[method] for subject, one in found.items() if method in one.means}
-        if means:
-            part = "" if len(means) == len(subjects) else f" ({len(means)} of {len(subjects)} subjects)"
-            name = f"**{name}**" if method == counted(about) else name
-            values = {subject: [one.get(metric) for metric in DIGITS] for subject, one in means.items()}
-            rows[f"{name}{part}"] = scores(values, list(means)).mul([1, 1, 100], axis=0)
-    texts = pd.DataFrame({name: row.reindex(columns=columns).apply(cell) for name, row in rows.items()}).T
-    texts.insert(0, "method", texts.index)
+    published: dict[str, dict[str, Sequence[float]]] = {row.method: dict(row.values) for row in about.rows}
+    for row in published.values():
+        if MEAN not in row and set(subjects) <= set(row):
+            row[MEAN] = pd.DataFrame(row)[list(subjects)].mean(axis=1).tolist()
     under = f", {about.table}" if about.table else ""
     head = f"# {about.title}\n\nPSNR (dB) / SSIM / LPIPS x 100{under}\n"
-    table = pipe_table(texts, numbers="left")
     said = [f"- {remark}" for remark in remarks(about, subjects, found)]
-    return "\n".join([head, table, "", *said, "", *faces(about, subjects, found)])
+    lines = [head, *method_table(SCORES, subjects, published, found, counted(about)), *said, ""]
+
+    cosines = {method: {MEAN: [cosine]} for method, cosine in about.faces.items()}
+    table = method_table(FACES, subjects, cosines, found)
+    if table:
+        head = "## Face consistency\n\nThe cosine of ArcFace's embeddings of the rendered and the true face\n"
+        unknown = ["- Not measured here: evaluate.arcface=FILE names ArcFace's ONNX file", ""]
+        known = any(FACES.keys() & of.keys() for one in found.values() for of in one.means.values())
+        lines += [head, *table, *([] if known else unknown)]
+    return "\n".join(lines)
 
 
-def faces(about: Dataset, subjects: Sequence[str], found: Mapping[str, Measured]) -> list[str]:
-    """The lines of the table of face consistency (ArcFace's mean cosine); none where nothing is known."""
-    rows = {f"{method} (published)": {MEAN: cosine} for method, cosine in about.faces.items()}
+def method_table(
+    metrics: Mapping[str, tuple[int, float]],
+    subjects: Sequence[str],
+    published: Mapping[str, Mapping[str, Sequence[float]]],
+    found: Mapping[str, Measured],
+    marked: str = "",
+) -> list[str]:
+    """The lines of a table of ``34.80 / 0.984 / 0.90``: a row a method, a column a subject and their mean.
+
+    Args:
+        metrics: name -> digits after the point, and a factor of what was measured.
+        subjects, found: as for ``comparison``.
+        published: method -> subject or mean -> a number a metric.
+        marked: the method of ``OURS`` that stands out.
+    """
+    rows = {f"{method} (published)": row for method, row in published.items()}
     for method, name in OURS.items():
-        means = {subject: one.means.get(method, {}).get(FACES) for subject, one in found.items()}
-        known = {subject: mean for subject, mean in means.items() if mean is not None}
-        if known:
-            part = "" if len(known) == len(subjects) else f" ({len(known)} of {len(subjects)} subjects)"
-            rows[f"{name}{part}"] = known | {MEAN: sum(known.values()) / len(known)}
-    if not rows:
-        return []
+        ours = {
+            subject: [factor * one.means[method].get(key, math.nan) for key, (_, factor) in metrics.items()]
+            for subject, one in found.items()
+            if metrics.keys() & one.means.get(method, {}).keys()
+        }
+        if ours:
+            part = "" if len(ours) == len(subjects) else f" ({len(ours)} of {len(subjects)} subjects)"
+            name = f"**{name}**" if method == marked else name
+            rows[f"{name}{part}"] = {**ours, MEAN: pd.DataFrame(ours).mean(axis=1).tolist()}
+    digits = [digits for digits, _ in metrics.values()]
     columns = [*(subject for subject in subjects if any(subject in row for row in rows.values())), MEAN]
-    texts = [
-        {"method": name, **{one: f"{row[one]:.4f}" if one in row else "-" for one in columns}}
-        for name, row in rows.items()
-    ]
-    head = "## Face consistency\n\nThe cosine of ArcFace's embeddings of the rendered and the true face\n"
-    missing = len(rows) == len(about.faces)
-    said = ["- Not measured here: evaluate.arcface=FILE names ArcFace's ONNX file", ""] if missing else []
-    return [head, pipe_table(pd.DataFrame(texts), numbers="left"), "", *said]
-
-
-def scores(values: Mapping[str, Sequence[float | None]], subjects: Sequence[str]) -> pd.DataFrame:
-    """PSNR, SSIM and LPIPS by row, a column a subject, the mean where it is not given and all are known."""
-    table = pd.DataFrame(values, index=list(DIGITS), dtype=float)
-    if MEAN not in table and set(subjects) <= set(table):
-        table[MEAN] = table[list(subjects)].mean(axis=1)
-    return table
-
-
-def cell(numbers: pd.Series) -> str:
-    """``34.80 / 0.984 / 0.90``, or a dash."""
-    if numbers.isna().all():
-        return "-"
-    return " / ".join("-" if pd.isna(n) else f"{n:.{DIGITS[metric]}f}" for metric, n in numbers.items())
+    texts = pd.DataFrame("-", pd.Index(rows, name="method"), columns)
+    for name, row in rows.items():
+        for column in row.keys() & set(columns):
+            cells = zip(row[column], digits, strict=True)
+            texts.loc[name, column] = " / ".join("-" if math.isnan(n) else f"{n:.{d}f}" for n, d in cells)
+    return [pipe_table(texts.reset_index(), numbers="left"), ""] if rows else []
 
 
 def counted(about: Dataset) -> str:

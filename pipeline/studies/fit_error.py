@@ -14,7 +14,7 @@ from pipeline.clip.curves import read_curve
 from pipeline.clip.fitted_clip import read_fitted_clip
 from pipeline.errors import UserError
 from pipeline.files.tables import read_table, vectors
-from pipeline.studies.variants import Base, Result, run_record
+from pipeline.studies.variants import Result, run_record
 
 FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0)  # of the base's own number of steps
 SEEN = 2  # the state of a true point that the camera sees (stages/ingest/mannequin/truth.py)
@@ -24,29 +24,20 @@ TRUTH = pa.schema(
 ANCHOR = "neck"  # in the picture whatever the framing; bodies are aligned there, frame by frame
 
 
-def fit_steps(own: int) -> list[int]:
-    """The numbers of steps that are compared, increasing."""
-    return sorted({max(1, round(own * factor)) for factor in FACTORS})
-
-
-def fit_numbers(base: Base, result: Result) -> dict[str, float | str]:
+def fit_numbers(result: Result, body_file: Path) -> dict[str, float]:
     """The time and error of one registration.
 
     Returns:
-        ``seconds`` of the registration alone; their ``clock``, wall-clock for a version from before processor
-        seconds were noted; ``pixels``, the mean distance of trusted keypoints from where they were detected;
-        ``millimetres``, the mean distance of the joints that the camera sees from the truth, aligned at the
-        neck, NaN where no truth is known.
+        ``seconds``, processor seconds of the registration alone; ``pixels``, the mean distance of trusted
+        keypoints from where they were detected; ``millimetres``, the mean distance of the joints that the
+        camera sees from the truth, aligned at the neck, NaN where no truth is known.
     """
     ingest, fit = result.folders["ingest"], result.folders["fit"]
-    timings = run_record(fit)["timings"]
-    processor = timings.get("registration_cpu_seconds")
     pixels = read_curve(fit / "curve.parquet", "run the fit stage again").get("pixels", [])
     return {
-        "seconds": timings.get("registration_seconds", math.nan) if processor is None else processor,
-        "clock": "wall-clock" if processor is None else "processor",
+        "seconds": run_record(fit)["timings"]["registration_cpu_seconds"],
         "pixels": pixels[-1][1] if pixels else math.nan,
-        "millimetres": truth_error(ingest, fit, base.request.workspace.body_file),
+        "millimetres": truth_error(ingest, fit, body_file),
     }
 
 

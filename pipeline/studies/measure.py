@@ -12,9 +12,9 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -22,7 +22,6 @@ import torch
 from pipeline.avatar import load_avatar
 from pipeline.avatar.bake import bake
 from pipeline.body import load_body
-from pipeline.clip.camera import Camera
 from pipeline.clip.composite import BACKGROUNDS, BLACK, composite_frame, over
 from pipeline.clip.fitted_clip import FittedClip, read_fitted_clip
 from pipeline.config.assets import require
@@ -54,11 +53,10 @@ class MeasurementCache:
     def read(self, name: str) -> Numbers | None:
         """The numbers under a name; None where there are none, or none that can be read."""
         try:
-            value = json.loads((self.folder / f"{name}.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            text = (self.folder / f"{name}.json").read_text(encoding="utf-8")
+            return {key: float(value) for key, value in json.loads(text).items()}
+        except (OSError, ValueError, TypeError, AttributeError):
             return None
-        known = isinstance(value, dict) and all(isinstance(one, (int, float)) for one in value.values())
-        return value if known else None
 
     def write(self, name: str, numbers: Mapping[str, float]) -> Numbers:
         """Keeps the finite ones of some numbers, and returns them."""
@@ -66,11 +64,6 @@ class MeasurementCache:
         known = {key: value for key, value in numbers.items() if math.isfinite(value)}
         write_atomically(self.folder / f"{name}.json", json_text(known))
         return known
-
-    def get(self, name: str, measure: Callable[[], Mapping[str, float]]) -> Numbers:
-        """The numbers under a name, measured now if there are none."""
-        known = self.read(name)
-        return self.write(name, measure()) if known is None else known
 
 
 class AvatarMeter:
@@ -82,8 +75,8 @@ class AvatarMeter:
     """
 
     def __init__(self, job: Job, ingest: Path) -> None:
-        background = getattr(job.settings["evaluate"], "background", "black")
-        self.background = background if background in ("black", "white") else "black"
+        background = job.settings["evaluate"].background
+        self.background = background if background in BACKGROUNDS else "black"
         self.ingest, self.body = ingest, load_body(job.workspace.body_file)
         self.lpips = Lpips(require(job.workspace, "lpips"), "alex")
         self.cache = MeasurementCache(job.workspace.data / "studies" / "measured" / job.subject.name)
@@ -98,7 +91,7 @@ class AvatarMeter:
             return result
         train, fit = (result.folders[stage].name for stage in ("train", "fit"))
         name = f"quality_{train}_{fit}_{self.ingest.name}_{self.background}"
-        quality = self.cache.get(name, lambda: self._quality(result))
+        quality = self.cache.read(name) or self.cache.write(name, self._quality(result))
         return dataclasses.replace(result, means={"avatar": quality})
 
     @torch.no_grad()
@@ -109,17 +102,17 @@ class AvatarMeter:
 
     def _frame_quality(self, gaussians: Gaussians, clip: FittedClip, frame: int) -> Numbers:
         rendering, mask = render(gaussians, clip.cameras[frame]), clip.mask(frame)
-        person = partial(composite_frame, clip.colors(frame), mask)
 
-        def picture(background: str) -> torch.Tensor:
-            return over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)
+        def pair(background: str) -> tuple[torch.Tensor, torch.Tensor]:
+            shown = over(rendering.color.float(), rendering.alpha.float(), background).clamp(0, 1)
+            return shown, composite_frame(clip.colors(frame), mask, background)
 
-        shown, truth = picture(self.background), person(self.background)
+        shown, truth = pair(self.background)
         return {
             "psnr": psnr(shown, truth),
-            "psnr_interior": psnr(picture(BLACK), person(BLACK), interior(mask)),
+            "psnr_interior": psnr(*pair(BLACK), interior(mask)),
             "ssim": ssim(shown, truth, BACKGROUNDS[self.background]),
-            "lpips_alex": float(self.lpips.distance(*map(self.lpips.features, (shown, truth)))),
+            "lpips_alex": float(self.lpips(shown, truth)),
         }
 
     @torch.no_grad()
@@ -154,48 +147,48 @@ class AvatarMeter:
     def _timed(self, avatars: Mapping[Path, tuple[FittedClip, Posed]]) -> dict[Path, Numbers]:
         clip, _ = next(iter(avatars.values()))
         frames = clip.spread(POSES, "test") or clip.spread(POSES)
-        camera, found = square(clip.cameras[frames[0]]), {}
-        for folder, (_, posed) in avatars.items():  # the first frame compiles and warms up
-            gaussians = posed(frames[0])
-            render(gaussians, camera)
-            floats = sum(tensor.numel() for tensor in gaussians.tensors())
-            found[folder] = {"gaussians": float(len(gaussians.means)), "asset_mib": 4 * floats / 2**20}
-        for repeat in range(REPEATS):
+        whole, rows = clip.cameras[frames[0]], []
+        side = min(whole.width, whole.height)  # the picture's middle is drawn
+        camera = whole.cropped((whole.width - side) // 2, (whole.height - side) // 2, side, side)
+        camera = camera.resized(SIDE, SIDE)
+        for repeat in range(1 + REPEATS):
             for folder, (_, posed) in avatars.items():
                 start = time.process_time()
-                gaussians = posed(frames[(repeat + 1) % len(frames)])
+                gaussians = posed(frames[repeat % len(frames)])
                 middle = time.process_time()
                 render(gaussians, camera)
                 took = {"animation_ms": middle - start, "rendering_ms": time.process_time() - middle}
-                for key, seconds in took.items():
-                    found[folder][key] = min(1e3 * seconds, found[folder].get(key, math.inf))
-        return found
+                size = 4 * sum(tensor.numel() for tensor in gaussians.tensors()) / 2**20
+                told = {"folder": folder, "gaussians": float(len(gaussians.means)), "asset_mib": size}
+                rows.append(told | {key: 1e3 * seconds for key, seconds in took.items()})
+        timed = pd.DataFrame(rows[len(avatars) :])  # the first frames compiled and warmed up
+        return timed.groupby("folder").min().to_dict("index")
 
 
 def score_table(
-    results: Sequence[Result], speeds: Mapping[Path, Numbers], method: str = "avatar"
+    results: Mapping[Any, Result], speeds: Mapping[Path, Numbers], method: str = "avatar"
 ) -> pd.DataFrame:
     """A row a result: its scores of held-out frames, what it took to make it, and what a frame of it costs.
 
     Args:
-        results: failures too, whose scores are NaN.
+        results: by the row's label; failures too, whose scores are NaN.
         speeds: as ``AvatarMeter.speeds`` gives them.
         method: of evaluate, whose scores count.
 
     Returns:
-        Columns are the keys of ``METRICS``; ``train_s`` and ``whole_s`` are processor seconds.
+        Columns are ``result`` and the keys of ``METRICS``; ``train_s`` and ``whole_s`` are processor seconds.
     """
-    rows = [one.held_out(method) | speeds.get(one.folders.get("train", Path()), {}) for one in results]
-    scores = pd.DataFrame(rows, range(len(rows))).reindex(columns=list(METRICS)).astype(float)
-    scores["train_s"] = [one.training_cost for one in results]
-    scores["whole_s"] = [math.nan if one.failure else sum(one.cpu_seconds.values()) for one in results]
+    rows = [
+        {
+            **one.means.get(method, {}),
+            **speeds.get(one.folders.get("train", Path()), {}),
+            "train_s": one.training_cost,
+            "whole_s": math.nan if one.failure else sum(one.cpu_seconds.values()),
+        }
+        for one in results.values()
+    ]
+    scores = pd.DataFrame(rows, pd.Index(list(results)), list(METRICS), dtype=float)
+    scores["result"] = pd.Series(list(results.values()), scores.index, dtype=object)
     scores["total_ms"] = scores["animation_ms"] + scores["rendering_ms"]
     scores["fps"] = 1e3 / scores["total_ms"]
     return scores
-
-
-def square(camera: Camera) -> Camera:
-    """The camera's middle as a picture of ``SIDE`` x ``SIDE`` pixels."""
-    side = min(camera.width, camera.height)
-    cropped = camera.cropped((camera.width - side) // 2, (camera.height - side) // 2, side, side)
-    return cropped.resized(SIDE, SIDE)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -49,32 +50,38 @@ def scatter(
         expected: preset -> its place on the x axis, of those whose y is not known; drawn if near.
     """
     points = points[points[["x", "y"]].abs().lt(math.inf).all(axis=1)]
-    figure, axes = _figure(across, up)
-    entries = {}
-    for number, point in points.iterrows():
-        preset, base = point.get("preset") or "", bool(point.get("base"))
-        kind = "preset" if preset else "base" if base else "frontier" if number in frontier else "beaten"
-        (mark,) = axes.plot(point["x"], point["y"], linestyle="none", **MARKS[kind])
-        entries[f"preset {preset}" if preset else kind] = mark
-    edge = points[points.index.isin(frontier)].sort_values("x")
-    (entries["frontier"],) = axes.plot(edge["x"], edge["y"], color=BLUE, linewidth=1.4, zorder=2)
-    for name, x in (expected or {}).items():
-        if x <= REACH * points["x"].max():
-            axes.axvline(x, color=ORANGE, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
-            beside = axes.get_xaxis_transform()  # x in the data's units, y from 0 to 1
-            axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, rotation=90, transform=beside)
-    _log_axis(axes, points["x"])
-    figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
-    figure.canvas.draw()  # places the axes, which labels are moved in
-    labels = [
-        axes.text(point["x"], point["y"], str(number), **NUMBERS[number in frontier])
-        for number, point in points.iterrows()
-    ]
-    if labels:
-        places, arrows = (points[name].tolist() for name in "xy"), {"arrowstyle": "-", "color": GREY}
-        looks = {"expand": (1.8, 1.9), "arrowprops": {**arrows, "linewidth": 0.6}}
-        adjust_text(labels, *places, ax=axes, force_text=(0.3, 0.3), iter_lim=300, **looks)
-    _save(figure, path)
+    with _plot(path, across, up) as axes:
+        entries = {}
+        for number, point in points.iterrows():
+            preset, base = point.get("preset") or "", bool(point.get("base"))
+            kind = "preset" if preset else "base" if base else "frontier" if number in frontier else "beaten"
+            (mark,) = axes.plot(point["x"], point["y"], linestyle="none", **MARKS[kind])
+            entries[f"preset {preset}" if preset else kind] = mark
+        edge = points[points.index.isin(frontier)].sort_values("x")
+        (entries["frontier"],) = axes.plot(edge["x"], edge["y"], color=BLUE, linewidth=1.4, zorder=2)
+        for name, x in (expected or {}).items():
+            if x <= REACH * points["x"].max():
+                axes.axvline(x, color=ORANGE, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
+                beside = axes.get_xaxis_transform()  # x in the data's units, y from 0 to 1
+                axes.text(x, 0.02, f" {name}", color=ORANGE, fontsize=8, rotation=90, transform=beside)
+        if points["x"].min() > 0:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(FixedLocator(round_ticks(*axes.get_xlim())))
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
+        axes.figure.legend(
+            entries.values(), entries, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5
+        )
+        assert isinstance(axes.figure, Figure)  # it is no part of another
+        axes.figure.draw_without_rendering()  # places the axes, which labels are moved in
+        labels = [
+            axes.text(point["x"], point["y"], str(number), **NUMBERS[number in frontier])
+            for number, point in points.iterrows()
+        ]
+        if labels:
+            places, arrows = (points[name].tolist() for name in "xy"), {"arrowstyle": "-", "color": GREY}
+            looks = {"expand": (1.8, 1.9), "arrowprops": {**arrows, "linewidth": 0.6}}
+            adjust_text(labels, *places, ax=axes, force_text=(0.3, 0.3), iter_lim=300, **looks)
 
 
 def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], across: str, up: str) -> None:
@@ -85,16 +92,15 @@ def curves(path: Path, lines: Mapping[str, Sequence[tuple[float, float]]], acros
         lines: name -> points (x, y); the first ones stand out.
         across, up: labels of the axes.
     """
-    figure, axes = _figure(across, up)
     shown = {name: line for name, line in lines.items() if line}
-    for place, (name, line) in enumerate(shown.items()):
-        first = place < len(LINES)
-        (drawn,) = axes.plot(*zip(*line, strict=True), marker=".", zorder=99 - place)
-        drawn.set(color=LINES[place] if first else GREY, linewidth=1.7 if first else 0.9)
-        drawn.set_label(name if first else "_")  # a name that the legend leaves out
-    if shown:
-        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7.5)
-    _save(figure, path)
+    with _plot(path, across, up) as axes:
+        for place, (name, line) in enumerate(shown.items()):
+            first = place < len(LINES)
+            (drawn,) = axes.plot(*zip(*line, strict=True), marker=".", zorder=99 - place)
+            drawn.set(color=LINES[place] if first else GREY, linewidth=1.7 if first else 0.9)
+            drawn.set_label(name if first else "_")  # a name that the legend leaves out
+        if shown:
+            axes.figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=7.5)
 
 
 def bars(path: Path, values: pd.Series, label: str, noise: float, higher_is_better: bool) -> None:
@@ -108,19 +114,20 @@ def bars(path: Path, values: pd.Series, label: str, noise: float, higher_is_bett
         higher_is_better: whether a value above zero is a gain.
     """
     known = values[values.abs() < math.inf][::-1]
-    figure, axes = _figure(label, "", (SIZE[0], 0.9 + 0.36 * max(3, len(known))))
-    colors = [ORANGE if (value < 0) == higher_is_better else BLUE for value in known]
-    drawn = axes.barh(known.index, known, color=colors, height=0.62, zorder=3)
-    texts = [f"{round(value, 2) + 0.0:+.2f}" for value in known]
-    axes.bar_label(drawn, texts, padding=3, fontsize=8, color=INK)
-    axes.axvline(0, color=INK, linewidth=0.8, zorder=4)
-    if math.isfinite(noise):
-        axes.axvspan(-abs(noise), abs(noise), color=GREY, alpha=0.3, zorder=1)
-    axes.margins(x=0.18)
-    _save(figure, path)
+    with _plot(path, label, "", (SIZE[0], 0.9 + 0.36 * max(3, len(known)))) as axes:
+        colors = [ORANGE if (value < 0) == higher_is_better else BLUE for value in known]
+        drawn = axes.barh(known.index, known, color=colors, height=0.62, zorder=3)
+        texts = [f"{round(value, 2) + 0.0:+.2f}" for value in known]
+        axes.bar_label(drawn, texts, padding=3, fontsize=8, color=INK)
+        axes.axvline(0, color=INK, linewidth=0.8, zorder=4)
+        if math.isfinite(noise):
+            axes.axvspan(-abs(noise), abs(noise), color=GREY, alpha=0.3, zorder=1)
+        axes.margins(x=0.18)
 
 
-def _figure(across: str, up: str, size: tuple[float, float] = SIZE) -> tuple[Figure, Axes]:
+@contextlib.contextmanager
+def _plot(path: Path, across: str, up: str, size: tuple[float, float] = SIZE) -> Iterator[Axes]:
+    """Empty axes with their labels; what has been drawn on them in the end is saved."""
     figure = Figure(figsize=size, dpi=170, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -129,17 +136,8 @@ def _figure(across: str, up: str, size: tuple[float, float] = SIZE) -> tuple[Fig
     axes.tick_params(labelsize=8.5)
     axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
-
-
-def _log_axis(axes: Axes, values: pd.Series) -> None:
-    """A logarithmic x axis with plain round numbers on it, however short it is."""
-    if values.empty or values.min() <= 0:
-        return
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(FixedLocator(round_ticks(*axes.get_xlim())))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
+    yield axes
+    figure.savefig(path, metadata={"Software": None})
 
 
 def round_ticks(low: float, high: float) -> list[float]:
@@ -150,7 +148,3 @@ def round_ticks(low: float, high: float) -> list[float]:
     if high < 5 * low:
         ticks = list(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high))
     return [tick for tick in ticks if low <= tick <= high]
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, metadata={"Software": None})

@@ -16,9 +16,8 @@ from pipeline.config.settings import as_dict
 from pipeline.run.job import shown
 from pipeline.store.artifact import read_manifest
 from pipeline.store.digest import write_atomically
-from pipeline.studies.sweep import mesh_of, picture_setting, setting_of
 from pipeline.studies.tables import Table, latex, markdown
-from pipeline.studies.variants import Base, Overrides, Result, Settings, run_record
+from pipeline.studies.variants import Base, Overrides, Result, run_record
 
 LIBRARIES = ("torch", "numba", "numpy")
 
@@ -27,46 +26,38 @@ Picture = tuple[Path, str]
 
 
 @dataclasses.dataclass(frozen=True)
-class Section:
-    """A part of the page; any of it may be left out.
-
-    Attributes:
-        heading: above it.
-        lines: sentences.
-        pictures: plots.
-        tables: numbers.
-        details: a summary, and the rows (name, value) that it unfolds to.
-    """
-
-    heading: str
-    lines: Sequence[str] = ()
-    pictures: Sequence[Picture] = ()
-    tables: Sequence[Table] = ()
-    details: Sequence[tuple[str, Sequence[tuple[str, str]]]] = ()
-
-
-@dataclasses.dataclass(frozen=True)
 class Page:
-    """Everything that a page shows.
+    """Everything that a study shows; its page ends with settings, times and versions.
 
     Attributes:
         title: of the page.
         lead: the one sentence that a reader can act on.
         lines: further sentences at the top.
         sections: in their order.
+        base: of the study, whose settings are shown in full.
+        changed: variant -> its overrides.
+        results: by the name to show; failures are left out.
+        seconds: of this call.
     """
 
     title: str
     lead: str
     lines: Sequence[str]
     sections: Sequence[Section]
+    base: Base
+    changed: Mapping[str, Overrides]
+    results: Mapping[str, Result]
+    seconds: float
 
 
-def study_folder(data: Path, kind: str, name: str) -> Path:
-    """The folder for a study's tables, plots and page; it is made."""
-    folder = data / "studies" / kind / name
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A part of the page: a heading, and below it sentences, plots and tables where there are any."""
+
+    heading: str
+    lines: Sequence[str] = ()
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
 
 
 def publish(folder: Path, page: Page, values: pd.DataFrame) -> None:
@@ -86,65 +77,29 @@ def publish(folder: Path, page: Page, values: pd.DataFrame) -> None:
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
     environment.filters["base64"] = lambda file: base64.b64encode(file.read_bytes()).decode("ascii")
-    write_atomically(folder / "report.html", environment.get_template("study.html.jinja").render(page=page))
+    done = {name: one for name, one in page.results.items() if not one.failure}
+    told = environment.get_template("study.html.jinja").render(
+        page=page,
+        settings={stage: as_dict(own) for stage, own in page.base.settings.items()},
+        done=done,
+        runs={  # what variants share counts once
+            one.folders[stage]: (one.seconds[stage], one.cpu_seconds[stage])
+            for one in done.values()
+            for stage in one.seconds
+        },
+        versions=versions_of(next(iter(done.values()))),
+    )
+    write_atomically(folder / "report.html", told)
     print(f"{text}\ntables, plots and page: {shown(folder)}")
 
 
-def closing_sections(
-    base: Base, changed: Mapping[str, Overrides], results: Mapping[str, Result], seconds: float
-) -> tuple[Section, Section]:
-    """The base's settings in full and what each variant overrides; what it all took, and the versions.
-
-    Args:
-        base: of the study.
-        changed: variant -> its overrides.
-        results: by the name to show; failures are left out.
-        seconds: of this call.
-    """
-    each = [(name, " ".join(f"{k}={v}" for k, v in own.items()) or "–") for name, own in changed.items()]
-    own = [
-        (f"{stage}: the study's own", [(f"{stage}.{n}", str(value)) for n, value in as_dict(one).items()])
-        for stage, one in base.settings.items()
-    ]
-    settings = Section("Settings", details=[("what each variant changes", each), *own])
-    done = {name: one for name, one in results.items() if not one.failure}
-    rows = [
-        (name, ", ".join(f"{s} {took:.0f}" for s, took in one.seconds.items())) for name, one in done.items()
-    ]
-    once = {  # what variants share counts once
-        one.folders[stage]: (one.seconds[stage], one.cpu_seconds[stage])
-        for one in done.values()
-        for stage in one.seconds
-    }
-    wall, cpu = (sum(times) / 60 for times in zip(*once.values(), strict=True))
-    line = (
-        f"The {len(once)} results that this stands on took {wall:,.0f} wall-clock minutes, {cpu:,.0f} "
-        f"minutes of processor time. This call took {seconds:,.0f} s: what the store held was not remade. "
-        "Wall-clock seconds are those of the run that made a result, whatever else the machine was doing."
-    )
-    versions = versions_of(next(iter(done.values())))
-    details = [("wall-clock seconds of each variant's stages", rows), ("versions", versions)]
-    return settings, Section("Time and versions", [line], details=details)
-
-
-def versions_of(result: Result) -> list[tuple[str, str]]:
+def versions_of(result: Result) -> dict[str, str]:
     """Stages, libraries and machine of a result."""
     manifests = {stage: read_manifest(folder) or {} for stage, folder in result.folders.items()}
     record = run_record(result.folders["train"])
-    return [
-        *((stage, f"version {manifest.get('version', '?')}") for stage, manifest in manifests.items()),
-        *((name, importlib.metadata.version(name)) for name in LIBRARIES),
-        ("Python", platform.python_version()),
-        ("machine", f"{record.get('cores')} cores, {record.get('machine')}"),
-    ]
-
-
-def sizes_of(settings: Settings) -> str:
-    """How large and how long the base's run is, in words."""
-    train, side = settings["train"], setting_of(settings, picture_setting(settings["ingest"]))
-    steps, small = f"{train.effort:g} times the plan's steps", ""
-    if train.iterations:
-        steps = f"{train.iterations:,} iterations"
-        small = "; small: a part that needs a long run shows less than it is worth"
-    small = small if train.iterations < 1000 else ""
-    return f"{steps}, {mesh_of(settings)}, pictures of {side} px{small}"
+    return {
+        **{stage: f"version {manifest.get('version', '?')}" for stage, manifest in manifests.items()},
+        **{name: importlib.metadata.version(name) for name in LIBRARIES},
+        "Python": platform.python_version(),
+        "machine": f"{record.get('cores')} cores, {record.get('machine')}",
+    }

@@ -1,19 +1,32 @@
-"""The designs of a tradeoff, made one after the other within a budget of seconds."""
+"""The designs of a tradeoff, registrations and presets, made one after the other within a budget of seconds.
+
+Not a full grid: the base, then every level of every sweep parameter alone, then combinations of the levels
+that gained most for their time.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable
 
 import pandas as pd
 
 from pipeline.errors import UserError
-from pipeline.studies.measure import Numbers, score_table
-from pipeline.studies.sweep import CHANCE, Design, Level, label_of, overrides_of, shortfalls
-from pipeline.studies.variants import Base, Result, Variant
+from pipeline.run.job import Job
+from pipeline.studies.fit_error import FACTORS, fit_numbers
+from pipeline.studies.sweep import (
+    GAUSSIANS,
+    PRECISION,
+    REPRESENTATION,
+    Design,
+    Level,
+    label_of,
+    overrides_of,
+    setting_of,
+)
+from pipeline.studies.variants import Base, Result, Variant, run_record
 
 
 def seconds_of(text: str) -> float:
@@ -103,34 +116,54 @@ class Search:
         ratio = cost / max(self.results[()].training_cost, 1e-9)
         return ratio if 0 < ratio < math.inf else level.factor
 
-    def points(self) -> pd.DataFrame:
-        """The designs that have been made so far; see ``point_table``."""
-        return point_table([(result, design, "") for design, result in self.results.items()])
+    def expected_cost(self, job: Job, levels: Iterable[Level]) -> float:
+        """Processor seconds that training under a job's settings would cost, from the levels tried alone.
 
+        Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
+        """
+        own, wanted, result = self.base.settings["train"], job.settings["train"], self.results[()]
+        cost = result.training_cost
+        marks = run_record(result.folders["train"])["timings"]["curve_seconds"] or [(1, 0.0, cost)]
+        done, _, iterating = marks[-1]  # the rest is spent before and after the steps
+        planned = done / own.effort if not own.iterations else done
+        cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
+        for level in levels:
+            if level.parameter in (GAUSSIANS, PRECISION, REPRESENTATION) and all(
+                str(setting_of(job.settings, name)).lower() == text for name, text in level.overrides.items()
+            ):
+                cost *= self.cost_ratio(level)
+        return cost
 
-Run = tuple[Result, Design | None, str]
-"""A result, its design (None for a preset), and the preset that it is (empty if none)."""
+    def run_fits(self) -> pd.DataFrame:
+        """Steps -> ``fit_numbers`` of registrations, as far as a quarter of the budget reaches."""
+        own = max(1, self.base.settings["fit"].iterations)
+        rows: dict[int, dict[str, float]] = {}
+        for steps in sorted({max(1, round(own * factor)) for factor in FACTORS}):
+            variant = Variant(f"fit of {steps} steps", {"fit.iterations": str(steps)})
+            seconds = self.results[()].seconds["fit"] * steps / own
+            late = self.spent + seconds > self.budget / 4
+            if rows and late and self.base.missing("fit", variant.overrides):
+                print(f"{variant.name} is left out: the budget")
+                continue
+            result = self.base.run(variant, ["fit"])
+            if result.failure:
+                print(f"{variant.name} failed: {result.failure}")
+            else:
+                rows[steps] = fit_numbers(result, self.base.request.workspace.body_file)
+        return pd.DataFrame.from_dict(rows, orient="index")
 
-
-def point_table(runs: Sequence[Run], speeds: Mapping[Path, Numbers] | None = None) -> pd.DataFrame:
-    """The points of a tradeoff, numbered from 1, in the order of their making.
-
-    Args:
-        runs: the base's first.
-        speeds: as ``AvatarMeter.speeds`` gives them.
-
-    Returns:
-        The columns of ``score_table``, ``result``, ``design`` and ``preset`` as in ``runs``, ``label``;
-        ``times``, training cost over the base's; ``gain``, dB over the base; ``chance``, true of another
-        seed, which is no choice; and ``short``, dB under the frontier, of the others.
-    """
-    results, designs, presets = zip(*runs, strict=True)
-    points = score_table(results, speeds or {})
-    points = points.assign(result=results, preset=presets, label=[one.variant for one in results])
-    points["design"] = pd.Series(designs, dtype=object)
-    points["chance"] = [bool(design) and design[0].parameter == CHANCE for design in designs]
-    points["times"] = points["train_s"] / max(points["train_s"].iloc[0], 1e-9)
-    points["gain"] = points["psnr"] - points["psnr"].iloc[0]
-    choices = points[~points["chance"]]
-    points["short"] = shortfalls(choices["train_s"], choices["psnr"])
-    return points.set_axis(points.index + 1)
+    def run_presets(self, levels: Iterable[Level]) -> tuple[dict[str, Result], dict[str, float]]:
+        """The presets that the store holds or half of what is left reaches; the others' expected cost."""
+        own = self.results[()]
+        results, expected = {}, {}
+        for path in sorted((self.base.request.workspace.definitions("presets")).glob("*.toml")):
+            base = self.base.under_preset(path.stem)
+            cost = self.expected_cost(base.job(), levels)
+            seconds = cost * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
+            if seconds <= (self.budget - self.spent) / 2 or not base.missing("train", {}):
+                result = self.run(base, Variant(f"preset {path.stem}"))
+                if not result.failure:
+                    results[path.stem] = result
+                    continue
+            expected[path.stem] = cost
+        return results, expected

@@ -1,18 +1,11 @@
-"""The settings that a tradeoff tries, in a fixed order, and which points nothing beats.
-
-Not a full grid: the base, then every level of every sweep parameter alone, then combinations of the levels
-that gained most for their time. A design is the tuple of levels that differ from the base; () is the base.
-"""
+"""The settings that a tradeoff tries alone, in a fixed order, and how large and fine the base's own are."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from pipeline.studies.variants import Settings, another_seed
@@ -21,7 +14,6 @@ SUBDIVISIONS = ("no subdivision", "one subdivision", "two subdivisions")
 CHANCE = "chance"  # the parameter that buys nothing: another seed
 GAUSSIANS, PRECISION, REPRESENTATION = "number of Gaussians", "precision", "representation"
 EDGES = (1.5, 0.7)  # times the base's longest edge between Gaussians
-MOST_COMBINED = 6  # levels that combinations are made of: 15 pairs, 20 triples, ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,14 +24,14 @@ class Level:
         parameter: its name.
         before: the base's own value, for tables.
         label: this value, for tables.
-        overrides: settings on top of the base's, as (name, text).
+        overrides: settings on top of the base's.
         factor: training time over the base's, as guessed until it has been measured.
     """
 
     parameter: str
     before: str
     label: str
-    overrides: tuple[tuple[str, str], ...]
+    overrides: Mapping[str, str] = dataclasses.field(hash=False)
     factor: float = 1.0
 
 
@@ -53,7 +45,7 @@ def label_of(design: Design) -> str:
 
 def overrides_of(design: Design) -> dict[str, str]:
     """The settings that a design sets on top of the base's."""
-    return {name: text for level in design for name, text in level.overrides}
+    return {name: text for level in design for name, text in level.overrides.items()}
 
 
 SCALED = (
@@ -77,30 +69,12 @@ SWITCHED = (
 
 def sweep_levels(settings: Settings) -> list[Level]:
     """Every level to try alone: each parameter's first before any parameter's second, the fastest first."""
-    levels = [
-        *_scaled(settings),
-        *_gaussians(settings),
-        *_kinds(settings),
-        *_switched(settings),
-        _chance(settings),
-    ]
-    parameters = pd.Series([level.parameter for level in levels])
-    depths = parameters.groupby(parameters).cumcount()
-    return [level for _, level in sorted(zip(depths, levels, strict=True), key=lambda x: (x[0], x[1].factor))]
-
-
-def _scaled(settings: Settings) -> Iterator[Level]:
-    """Multiples of the base's own number."""
-    for parameter, name, factors, multiple, exponent, words in SCALED:
-        name = name or picture_setting(settings["ingest"])
-        own = setting_of(settings, name)
-        if name == "train.effort" and settings["train"].iterations:
-            continue  # it is without effect then
-        for factor in factors:
-            value = round(multiple * round(own * factor / multiple), 2)
-            if value:
-                overrides = ((name, str(value)),)
-                yield Level(parameter, words.format(own), words.format(value), overrides, factor**exponent)
+    seed = another_seed(settings).overrides
+    chance = Level(CHANCE, f"seed {settings['train'].seed}", f"seed {seed['train.seed']}", seed)
+    levels = pd.DataFrame([*_scaled(settings), *_gaussians(settings), *_switched(settings), chance])
+    levels["depth"] = levels.groupby("parameter").cumcount()
+    rows = levels.sort_values(["depth", "factor"], kind="stable").drop(columns="depth")
+    return [Level(*row) for row in rows.itertuples(index=False)]
 
 
 def setting_of(settings: Settings, name: str) -> Any:
@@ -109,43 +83,14 @@ def setting_of(settings: Settings, name: str) -> Any:
     return getattr(settings[stage], field)
 
 
-def picture_setting(ingest: Any) -> str:
+def picture_setting(settings: Settings) -> str:
     """The setting of a picture's size in pixels: footage is reduced, a mannequin is filmed at it."""
-    return "ingest.mannequin_size" if ingest.mannequin else "ingest.long_side"
-
-
-def _kinds(settings: Settings) -> Iterator[Level]:
-    """The other representation, and the other precision where heads have one."""
-    train = settings["train"]
-    if is_triplane(settings):
-        words = ("float32", "bfloat16")
-        overrides = (("train.half_precision", str(not train.half_precision).lower()),)
-        yield Level(PRECISION, words[train.half_precision], words[not train.half_precision], overrides, 1.5)
-        yield Level(REPRESENTATION, "triplane", "bases", (("train.representation", "bases"),), 0.2)
-    else:
-        yield Level(REPRESENTATION, "bases", "triplane", (("train.representation", "triplane"),), 5.0)
+    return "ingest.mannequin_size" if settings["ingest"].mannequin else "ingest.long_side"
 
 
 def is_triplane(settings: Settings) -> bool:
     """True where the avatar is a triplane."""
     return settings["train"].representation == "triplane"
-
-
-def _gaussians(settings: Settings) -> Iterator[Level]:
-    """The density of the Gaussians: of bases the longest edge, of a triplane levels of subdivision."""
-    if not is_triplane(settings):
-        own = settings["plan"].edge_pixels
-        for factor in EDGES:
-            text = f"{round(own * factor, 1):g}"
-            overrides = (("plan.edge_pixels", text),)
-            yield Level(GAUSSIANS, mesh_of(settings), f"edges of {text} px", overrides, factor**-1.0)
-        return
-    mesh = mesh_of(settings)
-    own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
-    for count, label in enumerate(SUBDIVISIONS):
-        if label != mesh:  # "at most one": nobody knows yet whether it is none or one
-            finer = (("train.subdivisions", str(count)), ("plan.subdivision", "on"))
-            yield Level(GAUSSIANS, mesh, label, finer, 1.8 ** (count - own))
 
 
 def mesh_of(settings: Settings) -> str:
@@ -155,6 +100,52 @@ def mesh_of(settings: Settings) -> str:
     plan = settings["plan"].subdivision
     own = 0 if plan == "off" else settings["train"].subdivisions
     return f"at most {SUBDIVISIONS[own]}" if own and plan == "auto" else SUBDIVISIONS[own]
+
+
+def sizes_of(settings: Settings) -> str:
+    """How large and how long a run is, in words."""
+    train, side = settings["train"], setting_of(settings, picture_setting(settings))
+    steps = f"{train.iterations:,} iterations"
+    steps = steps if train.iterations else f"{train.effort:g} times the plan's steps"
+    short = 0 < train.iterations < 1000
+    small = "; small: a part that needs a long run shows less than it is worth" if short else ""
+    return f"{steps}, {mesh_of(settings)}, pictures of {side} px{small}"
+
+
+def _scaled(settings: Settings) -> Iterator[Level]:
+    """Multiples of the base's own number."""
+    for parameter, name, factors, multiple, exponent, words in SCALED:
+        name = name or picture_setting(settings)
+        own = setting_of(settings, name)
+        if name == "train.effort" and settings["train"].iterations:
+            continue  # it is without effect then
+        for factor in factors:
+            value = round(multiple * round(own * factor / multiple), 2)
+            if value:
+                override = {name: str(value)}
+                yield Level(parameter, words.format(own), words.format(value), override, factor**exponent)
+
+
+def _gaussians(settings: Settings) -> Iterator[Level]:
+    """The density of the Gaussians; the other representation; and the other precision of heads.
+
+    The density of bases is their longest edge, that of a triplane levels of subdivision.
+    """
+    mesh = mesh_of(settings)
+    if not is_triplane(settings):
+        for factor in EDGES:
+            text = f"{round(settings['plan'].edge_pixels * factor, 1):g}"
+            yield Level(GAUSSIANS, mesh, f"edges of {text} px", {"plan.edge_pixels": text}, factor**-1.0)
+        yield Level(REPRESENTATION, "bases", "triplane", {"train.representation": "triplane"}, 5.0)
+        return
+    own = next(count for count, label in enumerate(SUBDIVISIONS) if mesh.endswith(label))
+    for count, label in enumerate(SUBDIVISIONS):
+        if label != mesh:  # "at most one": nobody knows yet whether it is none or one
+            finer = {"train.subdivisions": str(count), "plan.subdivision": "on"}
+            yield Level(GAUSSIANS, mesh, label, finer, 1.8 ** (count - own))
+    half, words = settings["train"].half_precision, ("float32", "bfloat16")
+    yield Level(PRECISION, words[half], words[not half], {"train.half_precision": str(not half).lower()}, 1.5)
+    yield Level(REPRESENTATION, "triplane", "bases", {"train.representation": "bases"}, 0.2)
 
 
 def _switched(settings: Settings) -> Iterator[Level]:
@@ -169,74 +160,7 @@ def _switched(settings: Settings) -> Iterator[Level]:
     for part, setting, off, on, factor in SWITCHED:
         has, with_it, without = setting_of(settings, setting) != off, f"with {part}", f"without {part}"
         if has and not idle.get(part):
-            yield Level(part, with_it, without, ((setting, str(off)),), 1 / factor)
+            yield Level(part, with_it, without, {setting: str(off)}, 1 / factor)
         elif not has and on is not None:
             with_it += f" ({on})" if on != "auto" else ""
-            yield Level(part, without, with_it, ((setting, str(on)),), factor)
-
-
-def _chance(settings: Settings) -> Level:
-    """Another seed."""
-    overrides = tuple(another_seed(settings).overrides.items())
-    return Level(CHANCE, f"seed {settings['train'].seed}", f"seed {overrides[0][1]}", overrides)
-
-
-def noise_of(points: pd.DataFrame) -> float:
-    """How far another seed's PSNR is off, dB; NaN where none was reached."""
-    return points.loc[points["chance"], "gain"].abs().max()
-
-
-def combinations(points: pd.DataFrame) -> list[Design]:
-    """Pairs, then triples and more, of the levels that gained most for their time, the best first.
-
-    Levels count that gain more than chance does, and those that nothing beats, for they save time.
-
-    Args:
-        points: the base and what was tried so far: ``design``; ``gain``, dB over the base; ``times``,
-            training time over the base's; ``chance``, true of another seed.
-    """
-    noise = noise_of(points)
-    alone = points[~points["chance"] & points["design"].map(len).le(1)].dropna(subset=["gain", "times"])
-    unbeaten = alone.index.isin(frontier(alone["times"], alone["gain"]))
-    gaining = alone["gain"] > (noise if math.isfinite(noise) else 0.0)
-    kept = alone[(gaining | unbeaten) & alone["design"].map(bool)]
-    best = kept["design"][worth_of(kept).sort_values(kind="stable").index[::-1]][:MOST_COMBINED]
-    return [
-        tuple(levels)
-        for size in range(2, MOST_COMBINED + 1)
-        for levels in itertools.combinations(itertools.chain(*best), size)
-        if len({level.parameter for level in levels}) == size
-    ]
-
-
-def worth_of(points: pd.DataFrame) -> pd.Series:
-    """Quality gained for each e-fold of training time; a loss counts as it is.
-
-    Args:
-        points: ``gain``, dB over the base; ``times``, training time over the base's.
-    """
-    worth = points["gain"] / np.log(points["times"].clip(lower=1.02))
-    return worth.where(points["gain"] > 0, points["gain"])
-
-
-def frontier(costs: pd.Series, qualities: pd.Series) -> list[Any]:
-    """The labels of the points that no other dominates, the cheapest first.
-
-    A point dominates another if it costs no more and is no worse, and one of the two is strict. Of points
-    that are equal in both, the first one stands for all. Points with a number that is not finite never count.
-
-    Args:
-        costs: less is better.
-        qualities: more is better; of the same index.
-    """
-    points = pd.DataFrame({"cost": costs, "quality": qualities}).astype(float)
-    points = points[points.abs().lt(math.inf).all(axis=1)]
-    points = points.sort_values(["cost", "quality"], ascending=[True, False], kind="stable")
-    before = points["quality"].cummax().shift(fill_value=-math.inf)
-    return points.index[points["quality"] > before].tolist()
-
-
-def shortfalls(costs: pd.Series, qualities: pd.Series) -> pd.Series:
-    """The quality that each point lacks against the best of those that cost no more; 0 on the frontier."""
-    best = costs.map(lambda cost: qualities[costs <= cost].max())
-    return (best - qualities).clip(lower=0.0)
+            yield Level(part, without, with_it, {setting: str(on)}, factor)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 
@@ -10,7 +11,6 @@ import pandas as pd
 
 HERE, PAPER = "here", "paper"
 MEAN = "mean"  # in place of a subject, for a mean over subjects
-NOTHING = "–"
 NOTE, MAIN = "note", "main"  # columns of a table's rows that are no numbers
 
 
@@ -32,7 +32,7 @@ class Metric:
 
     def text(self, value: float) -> str:
         """A number as it is shown."""
-        return f"{self.factor * value:,.{self.digits}f}" if math.isfinite(value) else NOTHING
+        return f"{self.factor * value:,.{self.digits}f}" if math.isfinite(value) else "–"
 
     def best(self, values: pd.Series) -> pd.Series:
         """Whether each number is the best of two or more; what looks equal is equally good."""
@@ -45,23 +45,20 @@ IMAGE = {
     "ssim": Metric("SSIM", 4, "higher"),
     "lpips_alex": Metric("LPIPS×100", 2, "lower", 100.0),
 }
-REGIONS = {
-    f"{key}_{region}": dataclasses.replace(metric, label=f"{region} {metric.label}")
-    for region in ("face", "hands")
-    for key, metric in IMAGE.items()
-}
-RUNTIME = {
+METRICS: Mapping[str, Metric] = {
+    **IMAGE,
+    **{
+        f"{key}_{region}": dataclasses.replace(metric, label=f"{region} {metric.label}")
+        for region in ("face", "hands")
+        for key, metric in IMAGE.items()
+    },
+    **{f"{PAPER} {key}": dataclasses.replace(m, label=f"{PAPER}: {m.label}") for key, m in IMAGE.items()},
     "gaussians": Metric("Gaussians", 0),
     "asset_mib": Metric("asset MB", 2, "lower"),
     "animation_ms": Metric("animation ms", 1, "lower"),
     "rendering_ms": Metric("rendering ms", 1, "lower"),
     "total_ms": Metric("total ms", 1, "lower"),
     "fps": Metric("frames/s", 1, "higher"),
-}
-METRICS: Mapping[str, Metric] = {
-    **IMAGE,
-    **REGIONS,
-    **RUNTIME,
     "psnr_interior": Metric("inside", 2, "higher"),
     "train_s": Metric("training s", 0, "lower"),
     "times": Metric("× base", 2),
@@ -72,7 +69,7 @@ METRICS: Mapping[str, Metric] = {
     "pixels": Metric("px", 3, "lower"),
     "millimetres": Metric("mm to the truth", 2, "lower"),
 }
-"""Key of a number, as Parquet has it -> the way that tables show it."""
+"""Key of a number, as Parquet has it -> the way that tables show it; the paper's own has ``paper`` before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,9 +80,8 @@ class Table:
         name: in Parquet and in LaTeX's label.
         title: above it.
         caption: below it: sizes, and how it was measured.
-        rows: indexed by label; a column for each number, in their order, by its key in ``METRICS``, with
-            ``paper`` and a space before it if the paper published it; and optionally ``note`` (text beside a
-            row) and ``main`` (whether it stands out).
+        rows: indexed by label; a column for each number, in their order, by its key in ``METRICS``; and
+            optionally ``note`` (text beside a row) and ``main`` (whether it stands out).
         first: the head of the rows' labels.
         ranked: whether the best of each column is marked.
     """
@@ -102,24 +98,21 @@ class Table:
         """The rows' numbers, NaN where there is none."""
         return self.rows.drop(columns=[NOTE, MAIN], errors="ignore").astype(float)
 
-    @property
+    @functools.cached_property
     def texts(self) -> pd.DataFrame:
         """The numbers as they are shown, under their heads."""
-        return self.numbers.apply(lambda column: column.map(_metric(column.name).text)).rename(
-            columns=self.head
-        )
+        return pd.DataFrame({self._head(name): c.map(METRICS[name].text) for name, c in self.numbers.items()})
 
-    @property
+    @functools.cached_property
     def best(self) -> pd.DataFrame:
         """Whether each number is its column's best; of the shape of ``texts``."""
-        best = self.numbers.apply(lambda column: _metric(column.name).best(column) & self.ranked)
-        return best.rename(columns=self.head)
+        best = {self._head(name): METRICS[name].best(column) for name, column in self.numbers.items()}
+        return pd.DataFrame(best) & self.ranked
 
-    def head(self, name: str) -> str:
-        """A column's label with its arrow, and with the source where that is the paper."""
-        source, metric = name.rpartition(" ")[0], _metric(name)
-        arrow = {"higher": " ↑", "lower": " ↓"}.get(metric.better, "") if self.ranked else ""
-        return f"{f'{source}: ' if source else ''}{metric.label}{arrow}"
+    def _head(self, name: str) -> str:
+        """A column's label with its arrow."""
+        arrows = {"higher": " ↑", "lower": " ↓"} if self.ranked else {}
+        return METRICS[name].label + arrows.get(METRICS[name].better, "")
 
     @property
     def notes(self) -> list[str]:
@@ -133,19 +126,13 @@ class Table:
 
     def values(self, subject: str) -> pd.DataFrame:
         """A row a finite number: ``table``, ``row``, ``subject``, ``metric``, ``source``, ``value``."""
-        long = self.numbers.rename_axis(index="row", columns="name").stack().rename("value").reset_index()
+        long = self.numbers.rename_axis(index="row", columns="metric").stack().rename("value").reset_index()
         long = long[long["value"].notna()]
-        paper = long["name"].str.startswith(PAPER)
-        return pd.DataFrame({
-            "table": self.name, "row": long["row"], "subject": paper.map({True: MEAN, False: subject}),
-            "metric": long["name"].str.split().str[-1], "source": paper.map({True: PAPER, False: HERE}),
-            "value": long["value"],
-        })  # fmt: skip
-
-
-def _metric(name: str) -> Metric:
-    """The metric of a column, whoever measured it."""
-    return METRICS[name.split()[-1]]
+        paper = long["metric"].str.startswith(PAPER)
+        long["metric"] = long["metric"].str.removeprefix(f"{PAPER} ")
+        long["subject"], long["source"] = paper.map({True: MEAN, False: subject}), HERE
+        long.loc[paper, "source"] = PAPER
+        return long.assign(table=self.name)[["table", "row", "subject", "metric", "source", "value"]]
 
 
 def markdown(table: Table) -> str:
@@ -159,10 +146,6 @@ def markdown(table: Table) -> str:
     return f"{above}\n\n{pipe_table(shown)}\n"
 
 
-MARKDOWN = str.maketrans({"\\": "\\\\", "|": "\\|", "\n": " "})
-"""The letters that would end a cell."""
-
-
 def pipe_table(texts: pd.DataFrame, numbers: str = "right") -> str:
     """Texts as a Markdown table without its index; the first column and notes lie left.
 
@@ -170,9 +153,10 @@ def pipe_table(texts: pd.DataFrame, numbers: str = "right") -> str:
         texts: of the cells.
         numbers: where the other columns lie.
     """
+    ends = str.maketrans({"\\": "\\\\", "|": "\\|", "\n": " "})  # what would end a cell
     align = ["left" if place == 0 or name == NOTE else numbers for place, name in enumerate(texts)]
-    escaped = texts.map(lambda text: text.translate(MARKDOWN)).rename(columns=lambda n: n.translate(MARKDOWN))
-    return escaped.to_markdown(index=False, disable_numparse=True, colalign=align)
+    cells = texts.map(lambda text: text.translate(ends)).rename(columns=lambda name: name.translate(ends))
+    return cells.to_markdown(index=False, disable_numparse=True, colalign=align)
 
 
 LATEX = str.maketrans({
@@ -184,26 +168,27 @@ LATEX = str.maketrans({
 """The letters that LaTeX would take for something else, and those that its standard fonts lack."""
 
 
+def escaped(text: str) -> str:
+    """A text as LaTeX shows it."""
+    return text.translate(LATEX)
+
+
 def latex(table: Table) -> str:
     """The table for LaTeX with booktabs; notes stand below it."""
-
-    def escape(text: str) -> str:
-        return text.translate(LATEX)
-
-    bold = "textbf:--rwrap;"
-    shown, best = (one.rename(columns=escape, index=escape) for one in (table.texts.map(escape), table.best))
-    styled = shown.style.apply(lambda _: best.map({True: bold, False: ""}.get), axis=None)
-    styled = styled.apply_index(lambda _: [bold if main else "" for main in table.main])
+    bold = {True: "textbf:--rwrap;", False: ""}
+    styled = table.texts.style.format(escaped).format_index(escaped).format_index(escaped, axis=1)
+    styled.apply(lambda _: table.best.map(bold.get), axis=None)
+    styled.apply_index(lambda _: [bold[main] for main in table.main])
     text = styled.to_latex(
         hrules=True,
         position="t",
         position_float="centering",
-        column_format="l" + "r" * len(shown.columns),
-        caption=escape(f"{table.title}. {table.caption}"),
+        column_format="l" + "r" * len(table.texts.columns),
+        caption=escaped(f"{table.title}. {table.caption}"),
         label=f"tab:{table.name}",
     )
     notes = [
-        rf"\par\smallskip {{\footnotesize {escape(f'{label}: {note}')}.}}"
+        rf"\par\smallskip {{\footnotesize {escaped(f'{label}: {note}')}.}}"
         for label, note in zip(table.rows.index, table.notes, strict=True)
         if note
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -12,27 +12,14 @@ import pandas as pd
 from pipeline.clip.curves import read_curve
 from pipeline.config.request import Request
 from pipeline.errors import UserError
-from pipeline.run.job import Job
-from pipeline.studies.fit_error import fit_numbers, fit_steps
 from pipeline.studies.measure import AvatarMeter
 from pipeline.studies.plots import curves, scatter
-from pipeline.studies.report import Page, Picture, Section, closing_sections, publish, sizes_of, study_folder
-from pipeline.studies.search import Run, Search, point_table, seconds_of, spoken
-from pipeline.studies.sweep import (
-    GAUSSIANS,
-    PRECISION,
-    REPRESENTATION,
-    Level,
-    combinations,
-    frontier,
-    noise_of,
-    overrides_of,
-    setting_of,
-    sweep_levels,
-    worth_of,
-)
+from pipeline.studies.points import combinations, frontier, noise_of, point_table, worth_of
+from pipeline.studies.report import Page, Picture, Section, publish
+from pipeline.studies.search import Search, seconds_of, spoken
+from pipeline.studies.sweep import GAUSSIANS, overrides_of, sizes_of, sweep_levels
 from pipeline.studies.tables import MAIN, NOTE, Table
-from pipeline.studies.variants import Base, Result, Settings, Variant, base_of, run_record
+from pipeline.studies.variants import Base, Result, base_of, run_record
 
 DEFAULT_BUDGET = "20m"
 COLUMNS = [
@@ -87,7 +74,7 @@ def tradeoff(subject: str, request: Request) -> Path:
         UserError: a setting is wrong, or the base itself failed.
     """
     text = request.budget or DEFAULT_BUDGET
-    budget, folder = seconds_of(text), study_folder(request.workspace.data, "tradeoff", subject)
+    budget, folder = seconds_of(text), request.workspace.data / "studies" / "tradeoff" / subject
     base = base_of(subject, request, folder / "log.txt")
     levels = sweep_levels(base.settings)
     print(f"tradeoff of {subject}: {len(levels)} levels alone, then what combines, within {text}", flush=True)
@@ -102,91 +89,21 @@ def tradeoff(subject: str, request: Request) -> Path:
     own = search.make(())
     if own.failure:
         raise UserError(own.failure)
-    fits = run_fits(search)
+    fits = search.run_fits()
     search.make_affordable((level,) for level in levels)
-    presets, expected = run_presets(search, levels)
-    search.make_affordable(combinations(search.points()))
-
-    runs: list[Run] = [(one, design, "" if design else base.preset) for design, one in search.results.items()]
-    runs += [(result, None, preset) for preset, result in presets.items()]
-    points = point_table(runs, meters[0].speeds(result for result, _, _ in runs))
+    presets, expected = search.run_presets(levels)
+    search.make_affordable(combinations(point_table(search.results)))
+    speeds = meters[0].speeds([*search.results.values(), *presets.values()])
+    points = point_table(search.results, presets, speeds)
+    points.loc[1, "preset"] = base.preset
     write_tradeoff(folder, Tradeoff(base, points, expected, fits, budget, search.spent))
     return folder
 
 
-def run_fits(search: Search) -> pd.DataFrame:
-    """Registrations of several efforts, as far as a quarter of the budget reaches; see ``fit_numbers``."""
-    own = max(1, search.base.settings["fit"].iterations)
-    rows: dict[int, Mapping[str, float | str]] = {}
-    for steps in fit_steps(own):
-        overrides = {"fit.iterations": str(steps)}
-        seconds = search.results[()].seconds["fit"] * steps / own
-        late = search.spent + seconds > search.budget / 4
-        if rows and late and search.base.missing("fit", overrides):
-            print(f"fit of {steps} steps is left out: the budget")
-            continue
-        result = search.base.run(Variant(f"fit of {steps} steps", overrides), ["fit"])
-        if result.failure:
-            print(f"fit of {steps} steps failed: {result.failure}")
-        else:
-            rows[steps] = fit_numbers(search.base, result)
-    return pd.DataFrame.from_dict(rows, orient="index")
-
-
-def run_presets(search: Search, levels: Sequence[Level]) -> tuple[dict[str, Result], dict[str, float]]:
-    """The presets that the store holds or half of the budget's rest reaches; the others' expected cost."""
-    own = search.results[()]
-    results, expected = {}, {}
-    for path in sorted((search.base.request.workspace.definitions("presets")).glob("*.toml")):
-        base = search.base.under_preset(path.stem)
-        expected[path.stem] = expected_cost(search, base.job(), levels)
-        seconds = expected[path.stem] * sum(own.seconds.values()) / max(own.training_cost, 1e-9)
-        if base.missing("train", {}) and seconds > (search.budget - search.spent) / 2:
-            continue
-        result = search.run(base, Variant(f"preset {path.stem}"))
-        if not result.failure:
-            results[path.stem] = result
-            del expected[path.stem]
-    return results, expected
-
-
-def expected_cost(search: Search, job: Job, levels: Sequence[Level]) -> float:
-    """Processor seconds that training under a job's settings would cost, from the levels tried alone.
-
-    Steps count in proportion, Gaussians, precision and representation by what they were found to cost.
-    """
-    own, wanted, result = search.base.settings["train"], job.settings["train"], search.results[()]
-    cost = result.training_cost
-    marks = run_record(result.folders["train"])["timings"].get("curve_seconds") or [(1, 0.0, cost)]
-    done, iterating = float(marks[-1][0]), float(marks[-1][2])  # the rest is spent before and after the steps
-    planned = done / own.effort if not own.iterations else done
-    cost += iterating * ((wanted.iterations or planned * wanted.effort) / done - 1)
-    for level in levels:
-        if level.parameter not in (GAUSSIANS, PRECISION, REPRESENTATION):
-            continue
-        if all(_text(job.settings, name) == text for name, text in level.overrides):
-            cost *= search.cost_ratio(level)
-    return cost
-
-
-def _text(settings: Settings, name: str) -> str:
-    """The value of a setting as a command line has it."""
-    return str(setting_of(settings, name)).lower()
-
-
-def numbered(points: pd.DataFrame) -> pd.DataFrame:
-    """The points, indexed by ``number. label``."""
-    return points.set_axis(points.index.astype(str) + ". " + points["label"])
-
-
 def write_tradeoff(folder: Path, study: Tradeoff) -> None:
     """Writes the tables, the plots and the page."""
-    tables, points = tables_of(study), numbered(study.points)
+    tables, points = tables_of(study), study.points.set_index("label")
     failed = [result.variant for result in points["result"] if result.failure]
-    changed = {
-        name: {"preset": point["preset"]} if point["design"] is None else overrides_of(point["design"])
-        for name, point in points.iterrows()
-    }
     lines = [
         f"Settings that were tried within {spoken(study.budget)}: {len(points)}; each level of each sweep "
         "parameter alone, then combinations of those that gained most for their time. Gains smaller than "
@@ -196,9 +113,13 @@ def write_tradeoff(folder: Path, study: Tradeoff) -> None:
     sections = [
         Section("The frontier", frontier_lines(study), pictures=plots(folder, study)),
         *(Section(table.title, tables=[table]) for table in tables),
-        *closing_sections(study.base, changed, points["result"].to_dict(), study.seconds),
     ]
-    page = Page(f"{study.base.subject}: what accuracy costs", headline(study), lines, sections)
+    changed = {
+        name: {"preset": point["preset"]} if point["design"] is None else overrides_of(point["design"])
+        for name, point in points.iterrows()
+    }
+    title, results = f"{study.base.subject}: what accuracy costs", points["result"].to_dict()
+    page = Page(title, headline(study), lines, sections, study.base, changed, results, study.seconds)
     publish(folder, page, pd.concat([table.values(study.base.subject) for table in tables]))
 
 
@@ -216,32 +137,26 @@ def tables_of(study: Tradeoff) -> list[Table]:
     failures = points["result"].map(lambda one: one.failure and f"failed: {one.failure}")
     presets = ("preset " + points["preset"]).where(points["preset"].ne("") & points["design"].notna(), "")
     rows = points.assign(**{NOTE: failures + presets, MAIN: points.index.isin(study.frontier())})
-    rows = numbered(rows)[[*COLUMNS, NOTE, MAIN]]
+    rows = rows.set_index("label").rename_axis(None)[[*COLUMNS, NOTE, MAIN]]
     tables = [Table("tradeoff", f"What accuracy costs: {study.base.subject}", caption, rows)]
     if not study.fits.empty:
         told = (
-            f"Seconds ({' and '.join(sorted(set(study.fits['clock'])))}) of the registration alone. px: mean "
-            "distance of the trusted keypoints from where they were detected; mm: of the joints that the "
-            "camera sees from the truth, aligned at the neck."
+            "Seconds (processor) of the registration alone. px: mean distance of the trusted keypoints from "
+            "where they were detected; mm: of the joints that the camera sees from the truth, aligned at the "
+            "neck."
         )
-        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps").drop(columns="clock")
+        fits = study.fits.set_axis(study.fits.index.astype(str) + " steps")
         tables.append(Table("fits", "What the fit's effort buys", told, fits, first="fit"))
     return tables
 
 
 TRAINING = "processor seconds of training, views included"
+ANIMATION = "processor milliseconds to animate a frame"
 PLOTS = (
     # file, cost, metric, factor, label of the costs, label of the metric
     ("psnr_over_training", "train_s", "psnr", 1, TRAINING, "PSNR, dB"),
     ("lpips_over_training", "train_s", "lpips_alex", 100, TRAINING, "LPIPS×100"),
-    (
-        "psnr_over_animation",
-        "animation_ms",
-        "psnr",
-        1,
-        "processor milliseconds to animate a frame",
-        "PSNR, dB",
-    ),
+    ("psnr_over_animation", "animation_ms", "psnr", 1, ANIMATION, "PSNR, dB"),
 )
 FIT_PLOTS = (
     ("fit_pixels", "pixels", "Reprojection error, px"),
@@ -255,8 +170,8 @@ CURVES = (
 
 def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     """Draws every plot there is something for."""
-    points = study.points.assign(base=study.points.index == 1)
-    pictures = []
+    pictures: list[Picture] = []
+    points, fits = study.points.assign(base=study.points.index == 1), study.fits
     for name, cost, metric, factor, across, up in PLOTS:
         file, shown = folder / f"{name}.png", points.assign(x=points[cost], y=factor * points[metric])
         expected = study.expected if cost == "train_s" else {}
@@ -268,11 +183,8 @@ def plots(folder: Path, study: Tradeoff) -> list[Picture]:
     curves(file, training_curves(study), "wall-clock seconds of training", up)
     pictures.append((file, CURVES))
     for name, error, up in FIT_PLOTS:
-        if error in study.fits and study.fits[error].notna().any():
-            file, shown = (
-                folder / f"{name}.png",
-                study.fits.assign(x=study.fits["seconds"], y=study.fits[error]),
-            )
+        if error in fits and fits[error].notna().any():
+            file, shown = folder / f"{name}.png", fits.assign(x=fits["seconds"], y=fits[error])
             scatter(file, shown, frontier(shown["x"], -shown["y"]), "seconds of registration", up)
             told = f"{up.partition(',')[0]} against the registration's seconds; numbers are steps."
             pictures.append((file, told))
@@ -286,13 +198,13 @@ def training_curves(study: Tradeoff) -> dict[str, list[tuple[float, float]]]:
     """
     edge = study.frontier()
     order = sorted(study.points.index, key=lambda n: (n != 1, n not in edge, -study.points["psnr"][n]))
-    results, lines = numbered(study.points.loc[order])["result"], {}
-    for name, result in results.items():
-        if result.folders.get("ingest") == results.iloc[0].folders["ingest"]:
+    lines = {}
+    for label, result in study.points.loc[order, ["label", "result"]].itertuples(index=False):
+        if result.folders.get("ingest") == study.points.loc[1, "result"].folders["ingest"]:
             train, remedy = result.folders["train"], "run the train stage again"
-            seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"].get("curve_seconds", [])}
+            seconds = {mark[0]: mark[1] for mark in run_record(train)["timings"]["curve_seconds"]}
             line = read_curve(train / "curve.parquet", remedy).get("psnr", [])
-            lines[name] = [(seconds[step], value) for step, value in line if step in seconds]
+            lines[label] = [(seconds[step], value) for step, value in line if step in seconds]
     return lines
 
 
@@ -300,8 +212,8 @@ def frontier_lines(study: Tradeoff) -> list[str]:
     """The frontier in words, the cheapest first, and how far presets lie from it."""
     points, edge = study.points, study.frontier()
     lines = [
-        f"{name}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
-        for name, point in numbered(points.loc[edge]).iterrows()
+        f"{point['label']}: {point['psnr']:.2f} dB for {point['train_s']:.0f} s"
+        for _, point in points.loc[edge].iterrows()
     ]
     for number, point in points[points["preset"].ne("")].iterrows():
         where = "on" if number in edge else f"{point['short']:.2f} dB under"
@@ -334,7 +246,7 @@ def idle_change(study: Tradeoff, noise: float) -> str:
         sizes = sizes_of(study.base.settings)
         return f"{chance}: stay with {base['gaussians']:,.0f} Gaussians and {sizes}"
     perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
-    return f"{chance}: {as_good['label']}, at {times(as_good)}, does as well in PSNR ({perceived})"
+    return f"{chance}: {as_good['result'].variant}, at {times(as_good)}, does as well in PSNR ({perceived})"
 
 
 def change(point: pd.Series, base: pd.Series) -> str:

@@ -67,7 +67,7 @@ class Result:
         subject: whose avatar.
         variant: its name.
         failure: the reason in a line; empty where it did not fail. Then all below is empty.
-        means: method -> metric -> mean over the held-out frames, None where it has none.
+        means: method -> metric -> mean over the held-out frames, of the metrics that have one.
         seconds: stage -> wall-clock seconds of the run that made its version.
         cpu_seconds: stage -> processor seconds of all threads of it, less what compiling took.
         folders: stage -> where its version lies.
@@ -76,19 +76,10 @@ class Result:
     subject: str
     variant: str
     failure: str = ""
-    means: Mapping[str, Mapping[str, float | None]] = dataclasses.field(default_factory=dict)
+    means: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     cpu_seconds: Mapping[str, float] = dataclasses.field(default_factory=dict)
     folders: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-
-    def held_out(self, method: str = "avatar") -> dict[str, float]:
-        """Metric -> mean over the held-out frames, of the metrics that have one."""
-        return {metric: value for metric, value in self.means.get(method, {}).items() if value is not None}
-
-    @property
-    def psnr(self) -> float:
-        """The avatar's, dB; NaN where it was not measured."""
-        return self.held_out().get("psnr", math.nan)
 
     @property
     def training_cost(self) -> float:
@@ -99,7 +90,8 @@ class Result:
     @property
     def line(self) -> str:
         """One line for the terminal."""
-        done = f"{self.psnr:.2f} dB, trained in {self.training_cost:.0f} processor seconds"
+        psnr = self.means.get("avatar", {}).get("psnr", math.nan)
+        done = f"{psnr:.2f} dB, trained in {self.training_cost:.0f} processor seconds"
         return f"{self.subject}, {self.variant}: {f'failed: {self.failure}' if self.failure else done}"
 
 
@@ -130,8 +122,7 @@ class Base:
 
     def missing(self, stage: str, overrides: Overrides) -> list[str]:
         """The stages up to one that the store does not hold."""
-        job = self.job(overrides)
-        found: Found = {}
+        job, found = self.job(overrides), Found()
         return [name for name in job.upstream_first([stage]) if job.find(name, found) is None]
 
     def run(self, variant: Variant, stages: Iterable[str] | None = None) -> Result:
@@ -141,9 +132,15 @@ class Base:
             variant: overrides on top of the base's.
             stages: how far to go, as for ``make_results``.
         """
+        self.log.parent.mkdir(parents=True, exist_ok=True)
         try:
             versions = make_results(self.job(variant.overrides), stages, self.log)
-            return read_result(self.subject, variant.name, {n: one.folder for n, one in versions.items()})
+            folders = {stage: version.folder for stage, version in versions.items()}
+            means = read_summary(folders["evaluate"])["means"] if "evaluate" in folders else {}
+            records = {stage: run_record(folder) for stage, folder in folders.items()}
+            seconds = {stage: record["seconds"] for stage, record in records.items()}
+            cpu = {stage: cpu_seconds(record) for stage, record in records.items()}
+            return Result(self.subject, variant.name, "", means, seconds, cpu, folders)
         except (UserError, OSError) as error:
             return Result(self.subject, variant.name, str(error))
 
@@ -153,60 +150,40 @@ class Base:
         return dataclasses.replace(self, request=request, preset=preset)
 
 
-def base_of(subject: str, request: Request, log: Path, defaults: Overrides | None = None) -> Base:
+def base_of(subject: str, request: Request, log: Path, views: bool = False) -> Base:
     """A study's base: the request, on top of its scale, a lean evaluate and a curve of ten points.
 
     Args:
         subject: whose avatar.
         request: the command line's.
         log: a file for the stages' lines.
-        defaults: overrides that everything else wins over.
+        views: views are generated where the preset leaves them out.
 
     Raises:
         UserError: a setting or the scale is wrong.
     """
-    own = {**scale_overrides(request), **request.overrides}
+    if request.scale not in SCALES:
+        raise UserError(f"scale={request.scale}: there is no such scale; there are {', '.join(SCALES)}")
+    own = {**SCALES[request.scale], **request.overrides}
     settings = open_job(subject, dataclasses.replace(request, overrides=own)).settings
     lean = {f"evaluate.{n}": text for n, text in LEAN.items() if hasattr(settings.get("evaluate"), n)}
     train = settings.get("train")
     if train is not None:
         tenth = max(1, train.iterations // 10) if train.iterations else train.held_out_every
         lean["train.held_out_every"] = str(min(train.held_out_every, tenth))
+    if views and settings["auxiliary"].generator == "off":
+        lean["auxiliary.generator"] = "auto"
     changed = any(not name.startswith("evaluate.") for name in own)
-    full = dataclasses.replace(request, overrides={**(defaults or {}), **lean, **own})
+    full = dataclasses.replace(request, overrides={**lean, **own})
     return Base(subject, full, log, "" if changed else request.preset)
 
 
-def scale_overrides(request: Request) -> Overrides:
-    """The overrides that ``scale=`` stands for; UserError where there is no such scale."""
-    if request.scale not in SCALES:
-        raise UserError(f"scale={request.scale}: there is no such scale; there are {', '.join(SCALES)}")
-    return SCALES[request.scale]
-
-
-def read_result(subject: str, variant: str, folders: Mapping[str, Path]) -> Result:
-    """The scores and times that published versions hold.
-
-    Args:
-        subject, variant: names for the tables.
-        folders: stage -> its version.
-
-    Raises:
-        UserError: evaluate's file is damaged.
-    """
-    records = {stage: run_record(folder) for stage, folder in folders.items()}
-    return Result(
-        subject,
-        variant,
-        means=held_out_means(read_summary(folders["evaluate"])) if "evaluate" in folders else {},
-        seconds={stage: record["seconds"] for stage, record in records.items()},
-        cpu_seconds={stage: cpu_seconds(record) for stage, record in records.items()},
-        folders=folders,
-    )
-
-
 def read_summary(folder: Path) -> dict[str, Any]:
-    """``summary.json`` of a version of evaluate: its ``means``, and the choices that they depend on.
+    """``summary.json`` of a version of evaluate, with the choices that its means depend on.
+
+    Returns:
+        What it holds; its ``means`` are those of the held-out frames: method -> metric -> mean, of the
+        metrics that have one.
 
     Raises:
         UserError: the file is damaged.
@@ -214,15 +191,14 @@ def read_summary(folder: Path) -> dict[str, Any]:
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        dict(summary["means"].get("test", {}))
-        return summary
+        held_out = summary["means"].get("test", {})
+        means = {
+            method: {metric: value for metric, value in of.items() if value is not None}
+            for method, of in held_out.items()
+        }
+        return {**summary, "means": means}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} cannot be read ({error}): run the evaluate stage again") from None
-
-
-def held_out_means(summary: Mapping[str, Any]) -> Mapping[str, Mapping[str, float | None]]:
-    """Method -> metric -> mean over the held-out frames; empty where none are held out."""
-    return summary["means"].get("test", {})
 
 
 def run_record(folder: Path) -> dict[str, Any]:

@@ -12,66 +12,76 @@ from pipeline.config.request import parse_request
 from pipeline.config.workspace import REPOSITORY
 from pipeline.errors import UserError
 from pipeline.run.job import open_job
+from pipeline.run.process import make_results
 from pipeline.store.artifact import Store
-from pipeline.studies.ablation import FULL, variants_of
+from pipeline.studies.ablation import FULL, ablate, variants_of
 from pipeline.studies.measure import MeasurementCache
 from pipeline.studies.search import seconds_of
 from pipeline.studies.sweep import CHANCE, sweep_levels
 from pipeline.studies.variants import LEAN, Base, Variant, base_of
+from tests.pipeline.conftest import ToyProject
 
 VARIANTS = (
     Variant("base"),
     Variant("longer", {"paint.iterations": "4"}),
+    Variant("broken", {"bend.fail": "user"}),
+    Variant("wrong", {"paint.iterations": "many"}),
+    Variant("crashed", {"bend.fail": "bug"}),
     Variant("bent", {"bend.angle": "2"}),
 )
+GOOD = ("base", "longer", "bent")
 
 
 def words_of(toy, **more):
     return {"data": str(toy.data), "stages": "tests.pipeline.toy_stages", **more}
 
 
-def run(toy, variants=VARIANTS):
-    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
-    return [base.run(variant) for variant in variants]
-
-
-def test_what_variants_share_is_made_once_and_never_again(toy):
-    results = run(toy)
-    assert sorted(toy.ran()) == ["bend:ann"] * 2 + ["gather:ann"] + ["paint:ann"] * 3
-    assert [one.variant for one in results] == ["base", "longer", "bent"]
-    assert results[0].folders["bend"] == results[1].folders["bend"] != results[2].folders["bend"]
-    again = run(toy)
-    assert toy.ran() == []
-    assert [one.folders for one in again] == [one.folders for one in results]
-    assert all(set(one.seconds) == {"gather", "bend", "paint"} for one in again)
-
-
-def test_what_is_missing_of_a_variant_is_known_before_it_is_made(toy):
-    base = Base("ann", parse_request(words_of(toy)), toy.root / "log.txt")
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """A project, its study's base, name -> result of every variant, and what is in use beside them."""
+    toy = ToyProject(tmp_path_factory.mktemp("studied")).write()
+    base = Base("ann", parse_request(words_of(toy)), toy.root / "study" / "log.txt")
     assert base.missing("paint", {}) == ["gather", "bend", "paint"]
-    base.run(VARIANTS[0], ["bend"])
-    assert base.missing("paint", {}) == ["paint"] and base.missing("bend", {}) == []
-    assert base.missing("paint", VARIANTS[2].overrides) == ["bend", "paint"]
-
-
-def test_a_failing_variant_is_named_and_stops_no_other(toy):
-    broken = Variant("broken", {"bend.fail": "user"})
-    wrong = Variant("wrong", {"paint.iterations": "many"})
-    crashed = Variant("crashed", {"bend.fail": "bug"})
-    results = run(toy, (VARIANTS[0], broken, wrong, crashed, VARIANTS[2]))
-    assert [bool(one.failure) for one in results] == [False, True, True, True, False]
-    assert "clip.mp4: is not a clip; name another" in results[1].failure
-    assert "paint.iterations" in results[2].failure and "ZeroDivisionError" in results[3].failure
-    assert "broken" in results[1].line and "is not a clip" in results[1].line
-    assert not results[1].folders and not results[1].held_out()
-
-
-def test_what_was_in_use_stays_in_use(toy):
-    assert toy.doit("subject=ann", "bend.angle=7").returncode == 0
+    make_results(base.job({"bend.angle": "7"}))
     store = Store(toy.store)
-    before = {stage: store.latest("ann", stage).folder for stage in ("gather", "bend", "paint")}
-    run(toy)
-    assert {stage: store.latest("ann", stage).folder for stage in before} == before
+    latest = {stage: store.latest("ann", stage).folder for stage in ("gather", "bend", "paint")}
+    toy.ran()
+    results = {one.name: base.run(one) for one in VARIANTS}
+    assert sorted(toy.ran()) == ["bend:ann"] * 4 + ["paint:ann"] * 3  # what failed bent, too
+    return toy, base, results, latest
+
+
+def test_what_variants_share_is_made_once_and_never_again(studied):
+    toy, base, results, _ = studied
+    assert results["base"].folders["bend"] == results["longer"].folders["bend"]
+    assert results["base"].folders["bend"] != results["bent"].folders["bend"]
+    assert len({results[name].folders["paint"] for name in GOOD}) == 3
+    again = {one.name: base.run(one) for one in VARIANTS if one.name in GOOD}
+    assert toy.ran() == []
+    assert {name: one.folders for name, one in again.items()} == {n: results[n].folders for n in GOOD}
+    assert all(set(one.seconds) == {"gather", "bend", "paint"} for one in again.values())
+
+
+def test_what_is_missing_of_a_variant_is_known_before_it_is_made(studied):
+    _, base, _, _ = studied
+    assert base.missing("paint", {}) == base.missing("bend", {}) == []
+    assert base.missing("paint", {"paint.iterations": "9"}) == ["paint"]
+    assert base.missing("paint", {"bend.angle": "9"}) == ["bend", "paint"]
+
+
+def test_a_failing_variant_is_named_and_stops_no_other(studied):
+    _, _, results, _ = studied
+    assert [name for name, one in results.items() if one.failure] == ["broken", "wrong", "crashed"]
+    assert "clip.mp4: is not a clip; name another" in results["broken"].failure
+    assert "paint.iterations" in results["wrong"].failure
+    assert "ZeroDivisionError" in results["crashed"].failure
+    assert "broken" in results["broken"].line and "is not a clip" in results["broken"].line
+    assert not results["broken"].folders and not results["broken"].means
+
+
+def test_what_was_in_use_stays_in_use(studied):
+    toy, _, _, before = studied
+    assert {stage: Store(toy.store).latest("ann", stage).folder for stage in before} == before
 
 
 STUDY = """
@@ -155,7 +165,8 @@ def test_every_level_can_be_set_and_changes_something(subject, preset):
 
 
 def test_every_part_of_the_method_can_be_left_out(tmp_path):
-    base = base_of("smile", parse_request({}), tmp_path / "log.txt", {"auxiliary.generator": "auto"})
+    base = base_of("smile", parse_request({}), tmp_path / "log.txt", views=True)
+    assert base.settings["auxiliary"].generator == "auto"
     for key, variant in variants_of(base).items():
         assert (base.job(variant.overrides).settings == base.settings) == (key == FULL)
 
@@ -218,26 +229,20 @@ def test_no_budgets(text):
         seconds_of(text)
 
 
-def test_what_is_in_the_cache_is_not_measured_again(tmp_path):
-    cache, asked = MeasurementCache(tmp_path / "measured"), []
-
-    def measure():
-        asked.append(1)
-        return {"ms": 2.5, "unknown": float("nan")}
-
-    assert cache.get("a", measure) == cache.get("a", measure) == {"ms": 2.5}
-    assert len(asked) == 1
+def test_what_is_in_the_cache_is_not_lost(tmp_path):
+    cache = MeasurementCache(tmp_path / "measured")
+    assert cache.read("a") is None
+    assert cache.write("a", {"ms": 2.5, "unknown": float("nan")}) == cache.read("a") == {"ms": 2.5}
     (tmp_path / "measured" / "a.json").write_text("{")  # cut off
-    assert cache.get("a", measure) == {"ms": 2.5} and len(asked) == 2
+    assert cache.read("a") is None
 
 
 def test_the_dag_refuses_what_a_study_cannot_be_told(toy):
-    for words, hint in (
-        (("tradeoff", "subject=ann", "budget=soon"), "no length of time"),
-        (("ablate", "subject=ann", "scale=huge"), "there are preset, small"),
-        (("ablate", "subject=nobody"), "there is no"),
-    ):
-        run = toy.doit(*words)
-        assert run.returncode != 0
-        assert hint in run.stdout + run.stderr and "Traceback" not in run.stdout + run.stderr
+    words = ("tradeoff", "ablate", "subject=ann", "budget=soon", "scale=huge")
+    run = toy.doit(*words, options=("--continue",))
+    assert run.returncode != 0 and "Traceback" not in run.stdout + run.stderr
+    assert "no length of time" in run.stderr + run.stdout
+    assert "there are preset, small" in run.stderr + run.stdout
+    with pytest.raises(UserError, match="there is no"):
+        ablate("nobody", ["nobody"], toy.request())
     assert toy.ran() == [] and not (toy.data / "studies").exists()

@@ -30,12 +30,13 @@ from pipeline.studies.ablation import (
     write_ablation,
 )
 from pipeline.studies.fit_error import aligned_error
+from pipeline.studies.measure import score_table
 from pipeline.studies.plots import bars, curves, round_ticks, scatter
-from pipeline.studies.search import point_table
+from pipeline.studies.points import point_table
 from pipeline.studies.sweep import CHANCE as CHANCE_PARAMETER
 from pipeline.studies.sweep import Level, label_of
-from pipeline.studies.tables import LATEX, MAIN, NOTE, Table, latex, markdown
-from pipeline.studies.tradeoff import Tradeoff, plots, write_tradeoff
+from pipeline.studies.tables import LATEX, MAIN, METRICS, NOTE, Table, latex, markdown
+from pipeline.studies.tradeoff import Tradeoff, write_tradeoff
 from pipeline.studies.tradeoff import headline as pays
 from pipeline.studies.tradeoff import tables_of as points_of
 from pipeline.studies.variants import Result, base_of
@@ -101,22 +102,27 @@ def test_values_are_in_long_form_without_what_is_not_finite():
 
 def result(folder, variant, subject="smile", psnr=30.0, avatar="a", seconds=20.0, **metrics):
     """A result with the files that studies read, as the stages would leave them."""
-    folders = {}
-    for stage in ("ingest", "fit", "auxiliary", "train", "evaluate"):
-        folders[stage] = folder / f"{stage}_{subject}_{variant}" if stage == "train" else folder / stage
-        folders[stage].mkdir(parents=True, exist_ok=True)
-        files = [{"path": "avatar.safetensors", "sha256": avatar, "size": 1}]
-        manifest = {"version": 1, "key": "k", "files": files}
-        (folders[stage] / "manifest.json").write_text(json.dumps(manifest))
+    stages = ("ingest", "fit", "auxiliary", "train", "evaluate")
+    folders = {stage: folder / stage for stage in stages}
+    folders["train"] = folder / f"train_{subject}_{variant}"
+    for path in folders.values():
+        path.mkdir(parents=True, exist_ok=True)
+    files = [{"path": "avatar.safetensors", "sha256": avatar, "size": 1}]
+    (folders["train"] / "manifest.json").write_text(json.dumps({"version": 1, "key": "k", "files": files}))
     timings = {"curve_seconds": [[10, 2.0, 2.0], [20, 4.5, 4.4]]}
     (folders["train"] / "run.json").write_text(json.dumps({"cores": 2, "machine": "x", "timings": timings}))
-    line = {"iteration": np.array([10, 20], np.int32), "name": np.array(["psnr"] * 2, object)}
-    write_table(
-        folders["train"] / "curve.parquet", SCHEMA, line | {"value": np.array([psnr - 2, psnr], np.float32)}
-    )
     means = {"avatar": {"psnr": psnr, "ssim": 0.9, "lpips_alex": 0.05, **metrics}}
     times = {"train": 1.2 * seconds}, {"train": seconds}
     return Result(subject, variant, "", means, *times, folders)
+
+
+def with_curve(made):
+    """The same result, with its curve's file."""
+    psnr = made.means["avatar"]["psnr"]
+    line = {"iteration": np.array([10, 20], np.int32), "name": np.array(["psnr"] * 2, object)}
+    line["value"] = np.array([psnr - 2, psnr], np.float32)
+    write_table(made.folders["train"] / "curve.parquet", SCHEMA, line)
+    return made
 
 
 SPEED = {"gaussians": 5000.0, "asset_mib": 0.27, "animation_ms": 20.0, "rendering_ms": 5.0}
@@ -132,14 +138,13 @@ def ablation_of(folder, subjects=("smile",), dataset="samples", failing=(), refi
             results[subject, key] = (
                 Result(subject, name, "the clip | is gone")
                 if (subject, key) in failing
-                else result(
-                    folder, name, subject, psnr, "same" if same else key, psnr_face=25.0, psnr_hands=None
-                )
+                else result(folder, name, subject, psnr, "same" if same else key, psnr_face=25.0)
             )
             if refined and not results[subject, key].failure:
                 results[subject, key].means["avatar_refined"] = refined
     speeds = {one.folders["train"]: SPEED for one in results.values() if not one.failure}
-    return ablation.Ablation(results, speeds, dataset, bool(refined))
+    scores = score_table(results, speeds, "avatar_refined" if refined else "avatar")
+    return ablation.Ablation(scores.rename_axis(["subject", "variant"]), dataset, bool(refined))
 
 
 def by_name(found):
@@ -148,7 +153,8 @@ def by_name(found):
 
 def test_the_papers_tables_name_known_variants_and_every_variant_has_its_place():
     described = read_toml(ablation.Path(ablation.__file__).with_name("paper.toml"))["tables"]
-    assert {row["variant"] for table in described for row in table["rows"]} == set(VARIANTS)
+    assert {row["variant"] for table in described for row in table["rows"]} == {*VARIANTS, CHANCE}
+    assert {key for table in described for key in table.get("columns", [])} <= set(METRICS)
     for table in described:
         assert all(len(row["paper"]) == 3 for row in table["rows"] if "paper" in row)
 
@@ -185,8 +191,10 @@ def test_refined_poses_count_where_the_protocol_says_so(tmp_path):
 
 
 def test_the_papers_figures_stand_beside_the_same_dataset_alone(tmp_path):
-    def table(dataset, name, subjects=("bike", "citron")):
-        return by_name(ablation_of(tmp_path, subjects, dataset))[name]
+    bikes = ablation_of(tmp_path, ("bike", "citron"))
+
+    def table(dataset, name, found=bikes):
+        return by_name(dataclasses.replace(found, dataset=dataset))[name]
 
     beside = table("neuman", "refinement_and_views")
     assert beside.rows["paper psnr"].iloc[1] == 34.90
@@ -195,7 +203,8 @@ def test_the_papers_figures_stand_beside_the_same_dataset_alone(tmp_path):
     assert "paper psnr" not in table("insta", "refinement_and_views").rows
     assert table("insta", "visibility_and_fit").rows["paper psnr"].iloc[2] == 31.07
     assert "paper psnr" not in table("insta", "threshold").rows
-    assert table("insta", "threshold", ("biden",)).rows["paper psnr"].iloc[0] == 33.52
+    biden = ablation_of(tmp_path, ("biden",))
+    assert table("insta", "threshold", biden).rows["paper psnr"].iloc[0] == 33.52
     published = table("insta", "runtime").rows.iloc[2:]
     assert list(published["gaussians"]) == [167390, 84095]
 
@@ -233,28 +242,25 @@ def test_an_ablation_is_written(tmp_path):
 
 DESIGNS = (
     (),
-    (Level("iterations", "100 iterations", "400 iterations", (("train.iterations", "400"),)),),
-    (Level("number of Gaussians", "no subdivision", "one", (("train.subdivisions", "1"),)),),
-    (Level(CHANCE_PARAMETER, "seed 0", "seed 1", (("train.seed", "1"),)),),
+    (Level("iterations", "100 iterations", "400 iterations", {"train.iterations": "400"}),),
+    (Level("number of Gaussians", "no subdivision", "one", {"train.subdivisions": "1"}),),
+    (Level(CHANCE_PARAMETER, "seed 0", "seed 1", {"train.seed": "1"}),),
 )
 
 
 def tradeoff_of(folder, gains=(0.0, 2.0, 0.4, 0.1), costs=(20.0, 80.0, 30.0, 20.0)):
-    runs, speeds = [], {}
+    designs, speeds = {}, {}
     for number, (design, gain, cost) in enumerate(zip(DESIGNS, gains, costs, strict=True), 1):
-        one = result(folder, label_of(design), psnr=30 + gain, seconds=cost)
-        runs.append((one, design, ""))
+        one = designs[design] = result(folder, label_of(design), psnr=30 + gain, seconds=cost)
         speeds[one.folders["train"]] = {
             "gaussians": 5000.0, "animation_ms": 10.0 + number, "rendering_ms": 4.0
         }  # fmt: skip
-    runs.append((Result("smile", "both", "no memory"), DESIGNS[1] + DESIGNS[2], ""))
-    draft = result(folder, "preset draft", psnr=28.0, seconds=10.0)
-    means = {"avatar": {"psnr": 28.0, "lpips_alex": 0.1}}
-    runs.append((dataclasses.replace(draft, means=means), None, "draft"))
-    fits = {"seconds": [1.0, 4.0], "clock": "processor", "pixels": [3.0, 2.0], "millimetres": [20.0, 12.0]}
+    designs[DESIGNS[1] + DESIGNS[2]] = Result("smile", "both", "no memory")
+    draft = result(folder, "preset draft", psnr=28.0, seconds=10.0, lpips_alex=0.1)
+    fits = {"seconds": [1.0, 4.0], "pixels": [3.0, 2.0], "millimetres": [20.0, 12.0]}
     base = base_of("smile", parse_request({}), folder / "log.txt")
-    fits = pd.DataFrame(fits, index=[10, 40])
-    return Tradeoff(base, point_table(runs, speeds), {"balanced": 900.0}, fits, 60.0, 50.0)
+    points = point_table(designs, {"draft": draft}, speeds)
+    return Tradeoff(base, points, {"balanced": 900.0}, pd.DataFrame(fits, index=[10, 40]), 60.0, 50.0)
 
 
 def test_one_sentence_says_what_pays(tmp_path):
@@ -282,17 +288,19 @@ def test_another_seed_is_no_choice(tmp_path):
 
 def test_a_tradeoff_is_drawn_and_written(tmp_path):
     study = tradeoff_of(tmp_path)
-    pictures = [path for path, _ in plots(tmp_path, study)]
-    assert [path.stem for path in pictures] == [
-        "psnr_over_training", "lpips_over_training", "psnr_over_animation", "training_curves",
-        "fit_pixels", "fit_millimetres",
-    ]  # fmt: skip
-    assert all(cv2.imread(str(path)).std() > 5 for path in pictures)
+    for made in study.points["result"]:
+        if not made.failure:
+            with_curve(made)
     points, fits = points_of(study)
     assert points.main == [True, True, True, False, False, True]
     assert "no memory" in points.notes[4] and not any(points.notes[:4])
     assert points.numbers["times"].iloc[1] == 4 and len(fits.rows) == 2
     write_tradeoff(tmp_path, study)
+    assert {path.stem for path in tmp_path.glob("*.png")} == {
+        "psnr_over_training", "lpips_over_training", "psnr_over_animation", "training_curves",
+        "fit_pixels", "fit_millimetres",
+    }  # fmt: skip
+    assert all(cv2.imread(str(path)).std() > 5 for path in tmp_path.glob("*.png"))
     check_page(tmp_path / "report.html", pictures=6, tables=2)
     assert "preset draft" in (tmp_path / "table.md").read_text()
 
