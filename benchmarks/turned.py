@@ -57,7 +57,7 @@ ANGLES = (0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0, 135.0, 180.0, 225.0)
 SIDES = {"front": (0.0,), "sides": (60.0, -60.0, 90.0, -90.0), "behind": (135.0, 180.0, 225.0)}
 MOTION = {"full": "sway+gesture", "upper": "sway+gesture", "head": "nod+speech"}
 FIRST_SIDE = 100_000  # number of the first frame of another side
-OFF = {"unseen": "generated", "scale_shrink": 0.0, "weak_smoothness": 0.0}
+OFF = {"unseen": "generated", "scale_shrink": 0.0, "weak_smoothness": 0.0, "calm_from": 1.0}
 PLAIN, CEILING = "without", "ceiling"
 CONTESTANTS: Mapping[str, Mapping[str, Any]] = {
     PLAIN: OFF,
@@ -65,6 +65,7 @@ CONTESTANTS: Mapping[str, Mapping[str, Any]] = {
     "scales": {**OFF, "scale_shrink": TrainSettings().scale_shrink},
     "smoothness": {**OFF, "weak_smoothness": TrainSettings().weak_smoothness},
     "completion": {**OFF, "unseen": "completed"},
+    "calm": {**OFF, "calm_from": TrainSettings().calm_from},
     "together": {},
     CEILING: {},
 }

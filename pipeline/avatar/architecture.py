@@ -22,8 +22,8 @@ class Architecture:
         offset_unit, pose_offset_unit: metres that a head's output of 1 stands for.
         scale: initial standard deviation along the surface, in distances to the neighbours.
         thickness: initial standard deviation along the normal, in those along the surface.
-        inset: how far inside the body's surface Gaussians lie, in initial standard deviations along it, so that
-            many together, whose tails add up, end where the surface does.
+        inset: how far inside the body's surface Gaussians lie, in initial standard deviations along it: many
+            together, whose tails add up, then end where the surface does.
         opacity: of every Gaussian.
         residual_parts: parts that have a residual colour head, if any of their vertices is kept.
         residual_width: hidden channels of those heads.

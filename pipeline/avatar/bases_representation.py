@@ -141,6 +141,11 @@ class BasesRepresentation(Representation):
         self.bases[~seen] = 0.0
 
     @torch.no_grad()
+    def hold_colors(self, low: Tensor, high: Tensor) -> None:
+        """Keeps colours between two, each [N, 3], logits as ``color`` has them."""
+        self.color.clamp_(low, high)
+
+    @torch.no_grad()
     def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:
         """Takes the values as its own parameters: True."""
         # What is fully trusted, and has its size, stays as it is, to the byte.

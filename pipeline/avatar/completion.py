@@ -25,11 +25,14 @@ from pipeline.avatar.representation import Decoded
 from pipeline.avatar.surface import Surface
 from pipeline.body import Pose
 from pipeline.orbit_cameras import relaxed_pose
-from pipeline.texture.completion import complete_colors, complete_log_scales
+from pipeline.texture.completion import color_field, complete_colors, complete_log_scales
 from pipeline.texture.segments import Segments, find_segments
 
 ARMS = 1.0  # radians that they hang down while holes are looked for
 FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
+LEAST_OWN = 0.03  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
+OWN, FREE = 0.8, 0.4  # distance more for a squared cosine of 1; from this one on any
+HAIR = 0.5  # share from which a place is hair
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
 
@@ -101,8 +104,39 @@ def with_completed_colors(decoded: Decoded, segments: Segments, evidence: Eviden
     return dataclasses.replace(decoded, color_logit=torch.where(known, decoded.color_logit, logits))
 
 
+@torch.no_grad()
+def calm_colors(decoded: Decoded, evidence: Evidence) -> tuple[Tensor, Tensor]:
+    """Logits of the darkest and the brightest colour that evidence leaves each Gaussian, each [N, 3].
+
+    Both lie about what its segment shows there, as far from it as its part of the body usually is (a checked
+    shirt is farther than skin), and farther the more squarely frames saw it: what they saw from its edge
+    alone has the colours of whatever stands at that edge of the person. Hair is free: a few Gaussians, beyond
+    the horizon, make its soft rim.
+    """
+    none = torch.full_like(decoded.color_logit, torch.inf)
+    color, telling, normals = _arrays(torch.sigmoid(decoded.color_logit), evidence.source, evidence.normals)
+    if not (telling > 0).any():
+        return -none, none
+    segments = surface_segments(decoded.surface)
+    field, hair = (torch.from_numpy(one).to(none) for one in color_field(segments, color, telling, normals))
+    apart = (torch.sigmoid(decoded.color_logit) - field).abs().amax(1)
+    usual = _group_means(apart, evidence.source, torch.from_numpy(segments.part).to(none.device))
+    around = (LEAST_OWN + usual + OWN * evidence.square)[:, None]
+    bounds = [torch.logit((field + side * around).clamp(DARKEST, BRIGHTEST)) for side in (-1, 1)]
+    free = ((hair > HAIR) | (evidence.square > FREE))[:, None]
+    return torch.where(free, -none, bounds[0]), torch.where(free, none, bounds[1])
+
+
+def _group_means(values: Tensor, weights: Tensor, group: Tensor) -> Tensor:
+    """The weighted mean of each one's group, [N]; 0 where a group has no weight."""
+    count = int(group.max()) + 1
+    sums = [values.new_zeros(count).index_add_(0, group, one) for one in (weights * values, weights)]
+    return (sums[0] / sums[1].clamp_min(1e-12))[group]
+
+
 def _of_color(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:
-    return evidence.trust, evidence.normals, evidence.source
+    # What is trusted by half has been held near its segment's in training: its own colour is calm.
+    return evidence.trust.sqrt(), evidence.normals, evidence.source
 
 
 def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:

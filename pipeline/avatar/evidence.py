@@ -41,6 +41,7 @@ HIDDEN, OPEN = 0.15, 0.4  # shares: what shines through from behind, what is pla
 PROTRUDES = 0.02, 0.1  # shares: wholly hidden, its rim looks out from behind a silhouette
 KEPT = 0.005, 0.04  # mean share: nothing, and all, of what was learnt is kept; one frame of 24 is enough
 TELLS = 0.01, 0.12  # likewise, of what others are told by: one frame in eight
+FRONTAL = 0.02, 0.4  # squared cosines: others are told nothing, and all
 EDGE_ON = 0.25  # the least part of its area that a piece of surface covers, however it is turned
 COVERING = 0.75  # standard deviations in distances to the neighbours; 0.55 lets a tenth through between four
 RINGS = 1  # of neighbours that a share is taken of together
@@ -58,6 +59,8 @@ class Evidence:
         shape: [N] in [0, 1], the same of all pixels, also those beside the person: an empty pixel is evidence
             that nothing is there.
         facing: [N] in [0, 1], the mean cosine in the frames that showed it; 0 where none did.
+        square: [N] in [0, 1], the mean squared cosine in the frames that showed it, each of them counted by
+            that as well: near that of the frames that showed it most squarely; 0 where none did.
         color: [N, 3], its mean colour in them, RGB in [0, 1]; meaningless where ``frames`` is 0.
         normals: [N, 3], its mean normal in the world over all the frames; short where the body turned.
     """
@@ -66,6 +69,7 @@ class Evidence:
     frames: Tensor  # [N]
     shape: Tensor  # [N]
     facing: Tensor  # [N]
+    square: Tensor  # [N]
     color: Tensor  # [N, 3]
     normals: Tensor  # [N, 3]
 
@@ -82,7 +86,7 @@ class Evidence:
     @property
     def source(self) -> Tensor:
         """How far others may be told by its colour, [N] in [0, 1]: only what was seen squarely, and often."""
-        return ramp(self.seen, *TELLS)
+        return ramp(self.seen, *TELLS) * ramp(self.square, *FRONTAL)
 
     @property
     def together(self) -> Tensor:
@@ -97,6 +101,7 @@ class Evidence:
             frames=torch.maximum(self.frames, other.frames),
             shape=torch.maximum(self.shape, other.shape),
             facing=torch.maximum(self.facing, other.facing),
+            square=torch.maximum(self.square, other.square),
             color=share * self.color + (1 - share) * other.color,
             normals=self.normals,
         )
@@ -149,19 +154,20 @@ def gather_evidence(shown: Iterable[tuple[Gaussians, View]], surface: Surface) -
         count += 1
     if not sums:
         raise ValueError("evidence needs at least one frame")
-    seen, frames, shape, facing, color, normals = sums
+    seen, frames, shape, facing, second, fourth, color, normals = sums
     return Evidence(
         seen=seen / count,
         frames=frames / count,
         shape=shape / count,
         facing=facing / frames.clamp_min(1e-12),
+        square=fourth / second.clamp_min(1e-12),
         color=color / frames.clamp_min(1e-12)[:, None],
         normals=normals / count,
     )
 
 
 def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Tensor, ...]:
-    """One frame's part in the sums of ``Evidence``: four of [N], colour times share and normals, [N, 3]."""
+    """One frame's part in the sums of ``Evidence``: six of [N], colour times share and normals, [N, 3]."""
     means = gaussians.means.detach()
     normals = vertex_normals(means, faces)
     covered = covered_pixels(view.camera, means, faces)
@@ -179,7 +185,9 @@ def frame_evidence(gaussians: Gaussians, view: View, faces: Tensor) -> tuple[Ten
     # What has no weight of its own has the colour of what is around it.
     told = own + BORROWED * around
     mean = told[:, 3:] / told[:, :1].clamp_min(1e-12)
-    return seen, showed, shape, showed * cosine, mean * showed[:, None], normals
+    squared = cosine.square()
+    by_angle = (showed * cosine, showed * squared, showed * squared.square())
+    return seen, showed, shape, *by_angle, mean * showed[:, None], normals
 
 
 def pooled(

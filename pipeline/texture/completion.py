@@ -3,9 +3,14 @@
 For each vertex a *guess* is made of what is known elsewhere (``guess``): its mirror image where the other
 side was seen, else what was seen nearest on the same ring of the same limb, else of its segment. So garments
 end where they end in front, and what only the chest shows, a print or a shirt, is not carried to the back.
-Hair is the scalp's own: what resembles the skin of the face there, at the hairline, is no source.
-What is known beside it then bends the guess until both meet without a step, over a few centimetres
-(``screened_membrane`` of the difference: Perez et al., Poisson image editing, 2003).
+What is known beside it then bends the guess, over a few centimetres (``screened_membrane`` of the
+difference: Perez et al., Poisson image editing, 2003): each vertex by how much is known of it, the finest
+grain left out, and what stands out from the others around it hardly at all (``bent``). So neither the wall
+beside a silhouette nor an ear on the cheek is carried on.
+
+On a head hair and skin do not end where segments do. There two such fields are made, one of what is coloured
+as hair and one of what is coloured as skin, and mixed by which of the two is likelier at each place
+(``head_field``, ``hair_share``).
 
 The unseen side is not lit as the seen one: the lamp of a frontal clip stands in front. So log brightness is
 fitted as ``c_part + b . n`` over the known vertices, n being the normal in the world, robustly, since
@@ -23,7 +28,18 @@ import numpy as np
 import scipy.sparse as sparse
 
 from pipeline.texture.membrane import neighbours, screened_membrane
-from pipeline.texture.segments import BODY, FACE, NECK, OTHER_SIDE, SCALP, SKIN, Segments
+from pipeline.texture.segments import (
+    BODY,
+    FACE,
+    HEAD,
+    LEFT_HAND,
+    NECK,
+    OTHER_SIDE,
+    RIGHT_HAND,
+    SCALP,
+    SKIN,
+    Segments,
+)
 
 REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
 """Metres over which what is known beside a guess bends it; hands as the rest."""
@@ -31,6 +47,13 @@ REACH = {FACE: 0.06, SCALP: 0.02, NECK: 0.03, BODY: 0.03}
 RINGS = ((0.012, 1.0), (0.05, 1e-3), (10.0, 1e-6))  # widths along a limb, metres, and what each counts
 TURNS = ((0.6, 1.0), (10.0, 1e-6))  # widths around it, radians: a jacket's back is like its sides
 BIN, TURN_BINS = 0.004, 24  # metres along a limb; parts of a turn around it
+GRAIN = 0.012  # metres: what varies within less is left out of what bends a guess
+STANDS_OUT = 0.1  # distance from what lies around, in [0, 1], at which a colour tells little
+REWEIGHTED = 2  # rounds of that
+HEAD_REACH = 0.06  # metres, of hair and of skin on a head
+HAIRLINE = 0.012  # metres over which hair passes into skin where nothing is known
+MIXED = 0.25, 0.75  # shares of hair, between which both are mixed
+CLEAR = 0.5  # of the distance between hair and skin: what is farther from both is neither
 FIRM = 50.0  # how firmly a wholly trusted vertex is held, against an edge's 1
 SKIN_LIKE = 0.13  # distance of two colours, in [0, 1], at which they are hardly of one kind
 LEAST_SOURCE = 0.02  # what the skin's own colour still counts as a source of hair or cloth
@@ -62,12 +85,138 @@ def complete_colors(
     telling = trust if telling is None or not (telling > 0).any() else telling
     if not (telling > 0).any():
         return np.full((len(segments), 3), 0.5)
-    source = spreading(segments, color, telling)
+    share = np.clip(trust, 0, 1)[:, None].astype(np.float64)
+    if (share == 1).all():
+        return np.asarray(color, np.float64).copy()
+    field, _ = color_field(segments, color, telling, normals)
+    return np.where(share == 1, color, share * np.where(share > 0, color, 0) + (1 - share) * field)
+
+
+def color_field(
+    segments: Segments,
+    color: np.ndarray,  # [N, 3]
+    telling: np.ndarray,  # [N]
+    normals: np.ndarray | None = None,  # [N, 3]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The colour that each vertex has by what others of its kind show, calm and without grain: [N, 3].
+
+    The arguments are those of ``complete_colors``; some vertex tells something. The second value is how
+    likely each is hair, [N] in [0, 1].
+    """
     shade = np.ones((len(segments), 1))
+    source = spreading(segments, color, telling)
     if normals is not None:
         shade = np.exp(shading(color, source, normals, segments.part))[:, None]
-    guessed = guess(segments, color / shade, source)
-    return np.clip(completed(segments, color / shade, guessed, trust, source) * shade, 0, 1)
+    flat = color / shade
+    head = head_field(segments, flat, telling)
+    field, hair = np.empty_like(flat), segments.is_in(SCALP).astype(np.float64)
+    if head is not None:
+        field[segments.is_in(*HEAD)], hair[segments.is_in(*HEAD)] = head
+    rows = np.flatnonzero(np.ones(len(segments)) if head is None else ~segments.is_in(*HEAD))
+    reach = np.array([REACH.get(label, REACH[BODY]) for label in range(segments.label.max() + 1)])
+    guessed = guess(segments, flat, source)[rows]
+    links = neighbours(_among(segments.edges, rows, len(segments)), len(rows))
+    field[rows] = bent(
+        links, guessed, flat[rows], source[rows], segments.spacing[rows], reach[segments.label[rows]]
+    )
+    return np.clip(field * shade, 0, 1), hair
+
+
+def bent(
+    links: sparse.csr_matrix,  # [M, M]
+    guessed: np.ndarray,  # [M, 3]
+    color: np.ndarray,  # [M, 3]
+    source: np.ndarray,  # [M]
+    spacing: np.ndarray,  # [M]
+    reach: np.ndarray,  # [M]
+) -> np.ndarray:
+    """Guesses bent by the colours beside them; those that stand out are outvoted: [M, 3].
+
+    Args:
+        links: the graph of the vertices.
+        guessed: of every vertex.
+        color: what is known; of no consequence where source is 0.
+        source: in [0, 1], how much each tells.
+        spacing: metres between neighbours.
+        reach: metres over which a guess is bent.
+    """
+    difference = np.where(source[:, None] > 0, color - guessed, 0)
+    sink, hold = np.maximum((spacing / reach) ** 2, 1e-6), (spacing / GRAIN) ** 2 * source
+    moved, fits = np.zeros_like(difference), np.ones(len(source))
+    for _ in range(REWEIGHTED):
+        moved = screened_membrane(links, difference, hold * fits, sink)
+        fits = (1 + (distance(difference, moved) / STANDS_OUT) ** 2) ** -2
+    return guessed + moved
+
+
+def head_field(
+    segments: Segments, flat: np.ndarray, telling: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The colours of face, scalp and neck, mixed of hair and skin, [M, 3], and the share of hair, [M].
+
+    None where the head shows but one of the two.
+
+    Args:
+        segments: of the surface.
+        flat: [N, 3], colours without shading.
+        telling: [N] in [0, 1].
+    """
+    tones = head_tones(segments, flat, telling)
+    if tones is None:
+        return None
+    rows = np.flatnonzero(segments.is_in(*HEAD))
+    links = neighbours(
+        _among(np.concatenate([segments.edges, segments.seams]), rows, len(segments)), len(rows)
+    )
+    away = np.stack([distance(flat, tone) for tone in tones]) / distance(tones[:1], tones[1])
+    clear = 1 / (1 + (away.min(0) / CLEAR) ** 4)
+    hair_like = 1 / (1 + np.exp(np.clip(8 * (away[1] - away[0]), -50, 50)))
+    share = hair_share(segments, links, rows, hair_like, telling * clear)
+    fields = []
+    for tone, like in zip(tones, (1 - hair_like, hair_like), strict=True):
+        source = telling * clear * like
+        mirrored = segments.mirrored[rows]
+        known = (source[mirrored] * segments.is_in(*HEAD)[mirrored])[:, None]
+        guessed = known * flat[mirrored] + (1 - known) * tone
+        reach = np.full(len(rows), HEAD_REACH)
+        fields.append(bent(links, guessed, flat[rows], source[rows], segments.spacing[rows], reach))
+    return fields[0] + share[:, None] * (fields[1] - fields[0]), share
+
+
+def head_tones(segments: Segments, flat: np.ndarray, telling: np.ndarray) -> np.ndarray | None:
+    """The colours of a head's skin and hair, [2, 3]; None where either is unknown or they are alike."""
+    face, scalp = segments.is_in(FACE), segments.is_in(SCALP)
+    if not (telling[face] > 0).any():
+        return None
+    skin = weighted_median(flat[face], telling[face] ** 2)
+    weight = telling[scalp] ** 2 * np.clip(distance(flat[scalp], skin) / SKIN_LIKE - 0.5, 0, 1)
+    if not (weight > 0).any():
+        return None
+    tones = np.stack([skin, weighted_median(flat[scalp], weight)])
+    return tones if distance(tones[:1], tones[1])[0] > SKIN_LIKE else None
+
+
+def hair_share(
+    segments: Segments,
+    links: sparse.csr_matrix,  # [M, M]
+    rows: np.ndarray,  # [M]
+    hair_like: np.ndarray,  # [N]
+    telling: np.ndarray,  # [N]
+) -> np.ndarray:
+    """How likely each vertex of a head is hair, by colour where it tells, else by its segment: [M]."""
+    scalp = segments.is_in(SCALP)[rows].astype(np.float64)
+    hold = (segments.spacing[rows] / HAIRLINE) ** 2
+    known = FIRM * telling[rows] ** 2
+    values = (hold * scalp + known * hair_like[rows]) / (hold + known)
+    share = screened_membrane(links, values[:, None], hold + known, np.zeros(len(rows)))[:, 0]
+    return np.clip((share - MIXED[0]) / (MIXED[1] - MIXED[0]), 0, 1)
+
+
+def _among(edges: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """The edges between some of ``count`` vertices, numbered by their places in ``rows``."""
+    place = np.full(count, -1)
+    place[rows] = np.arange(len(rows))
+    return place[edges[(place[edges] >= 0).all(1)]]
 
 
 def complete_log_scales(
@@ -122,7 +271,8 @@ def spreading(
     """How far each vertex may be a source of others: [N] float64 in [0, 1].
 
     It is trust, and less on scalp and body where the colour is that of the face's skin: a forehead under the
-    hairline, the neck above a collar. Where all of a segment is of that colour all of it counts alike.
+    hairline, the neck above a collar; on hands less where it is not: the shirt behind them. Where all of a
+    segment is so all of it counts alike.
     """
     face = segments.is_in(FACE)
     source = np.clip(trust, 0, 1).astype(np.float64)
@@ -130,9 +280,10 @@ def spreading(
         return source
     skin = weighted_median(color[face], source[face])
     like = np.exp(-(distance(color, skin) ** 2) / (2 * (SKIN_LIKE / 2) ** 2))
-    for label in (SCALP, BODY):
+    for label in (SCALP, BODY, LEFT_HAND, RIGHT_HAND):
         rows = segments.is_in(label)
-        source[rows] *= np.maximum(1 - like[rows], LEAST_SOURCE)
+        fits = 1 - like[rows] if label in (SCALP, BODY) else np.sqrt(like[rows])
+        source[rows] *= np.maximum(fits, LEAST_SOURCE)
         largest = source[rows].max(initial=0.0)
         source[rows] /= max(largest, 1e-12) if 0 < largest < 0.5 else 1.0
     return source

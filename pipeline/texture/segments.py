@@ -21,6 +21,7 @@ from pipeline.body.parts import PARTS
 FACE, SCALP, NECK, BODY, LEFT_HAND, RIGHT_HAND = range(6)
 OTHER_SIDE = np.array([FACE, SCALP, NECK, BODY, RIGHT_HAND, LEFT_HAND])  # the mirror image's segment
 SKIN = (FACE, NECK, LEFT_HAND, RIGHT_HAND)
+HEAD = (FACE, SCALP, NECK)
 EARS = 0.03  # metres behind the jaw's hinge, as far as the ears reach
 EAR_TOP = 0.025  # metres above the eyes, as high as the ears reach: what lies higher at the side is scalp
 _ALONG_X = ("left_arm", "right_arm", "left_hand", "right_hand")  # in T pose; all else lies along Y
@@ -32,6 +33,7 @@ class Segments:
 
     Attributes:
         edges: [E, 2] int64, each edge of the mesh once that does not cross between segments.
+        seams: [S, 2] int64, those that do.
         label: [N] int64, FACE with the ears, SCALP, NECK, BODY (trunk, arms, legs), LEFT_HAND or RIGHT_HAND.
         part: [N] int64, index into ``PARTS``.
         along: [N] float64, metres along the part's limb: a ring around it has one value.
@@ -42,6 +44,7 @@ class Segments:
     """
 
     edges: np.ndarray
+    seams: np.ndarray
     label: np.ndarray
     part: np.ndarray
     along: np.ndarray
@@ -87,8 +90,10 @@ def find_segments(
     )
     part = parts.long().numpy()
     along_x = np.isin(part, [PARTS.index(name) for name in _ALONG_X])
+    within = label[pairs[:, 0]] == label[pairs[:, 1]]
     return Segments(
-        edges=pairs[label[pairs[:, 0]] == label[pairs[:, 1]]],
+        edges=pairs[within],
+        seams=pairs[~within],
         label=label,
         part=part,
         along=np.where(along_x, np.abs(places[:, 0]), places[:, 1]),

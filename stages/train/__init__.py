@@ -5,7 +5,7 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=8,
+    version=9,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={

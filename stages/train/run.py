@@ -15,6 +15,7 @@ from pipeline.metrics import Lpips
 from pipeline.numba_kernels import threads
 from pipeline.run.compile_timer import CompileTimer, compile_timer
 from pipeline.run.stage import Context
+from stages.train.calm_colors import CalmColors
 from stages.train.checkpoint import NAME, read_checkpoint, run_key
 from stages.train.data import TrainingData, read_training_data
 from stages.train.frame_choice import frames_to_draw
@@ -133,6 +134,9 @@ def build_trainer(
     hooks: dict[str, Hook] = {}
     if settings.gate:
         hooks["gate"] = VisibilityGate(avatar, len(data.clip.body.v_template), settings)
+    if settings.representation == "bases" and settings.calm_from < 1:
+        first = max(1, round(settings.calm_from * settings.iterations))
+        hooks["calm"] = CalmColors(avatar.base_color, first)
     if settings.skinning == "nearest":
         hooks["skinning"] = NearestSkinning(settings.skin_every)
     return Trainer(avatar, refinement, data, settings, network, hooks)

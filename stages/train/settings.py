@@ -47,7 +47,7 @@ PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose resid
 IGNORED = {
     "triplane": (
         "edge_pixels", "bases", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
-        "bases_learning_rate",
+        "bases_learning_rate", "calm_from",
     ),
     "bases": (
         "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
@@ -253,6 +253,11 @@ class TrainSettings:
     scale_shrink: Weight = setting(0.002, "log scales below the initial ones, at which neighbours cover")
     weak_smoothness: Factor = setting(
         10.0, "times more that smoothness counts where no frame showed enough, continuously"
+    )
+    calm_from: Fraction = setting(
+        0.2,
+        "fraction of the run from which colours of surface that frames saw from its edge alone are held to "
+        "its segment's; 1: never",
     )
     joint_change: Weight = setting(0.0, "size of learnt joint offsets, metres squared; tenfold on the hands")
     joint_symmetry: Weight = setting(0.0, "differences of left and right joint offsets, metres")
