@@ -115,7 +115,7 @@ class TrainSettings:
     offset_unit: Metres = setting(0.04, "metres that a static offset of 1 stands for")
     pose_offset_unit: Metres = setting(0.01, "metres that a pose-dependent offset of 1 stands for")
     scale: Size = setting(0.55, "initial standard deviation of a Gaussian, in mean edge lengths")
-    thickness: Size = setting(0.4, "initial standard deviation along the normal, in those along the surface")
+    thickness: Size = setting(0.5, "initial standard deviation along the normal, in those along the surface")
     inset: Inset = setting(
         0.7, "how far inside the body's surface Gaussians begin, in their standard deviations along it"
     )
