@@ -22,6 +22,8 @@ class Architecture:
         offset_unit, pose_offset_unit: metres that a head's output of 1 stands for.
         scale: initial standard deviation along the surface, in distances to the neighbours.
         thickness: initial standard deviation along the normal, in those along the surface.
+        inset: how far inside the body's surface Gaussians lie, in initial standard deviations along it: many
+            together, whose tails add up, then end where the surface does.
         opacity: of every Gaussian.
         residual_parts: parts that have a residual colour head, if any of their vertices is kept.
         residual_width: hidden channels of those heads.
@@ -47,6 +49,7 @@ class Architecture:
     pose_offset_unit: float = 0.01
     scale: float = 0.55
     thickness: float = 0.5
+    inset: float = 0.0
     opacity: float = 0.999
     residual_parts: tuple[str, ...] = ()
     residual_width: int = 64

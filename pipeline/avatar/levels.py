@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from torch import Tensor
 
 from pipeline.avatar.architecture import Architecture
-from pipeline.avatar.canonical import HANDS, HEAD, build_canonical, corrected_only, open_positions
+from pipeline.avatar.canonical import (
+    HANDS,
+    HEAD,
+    Canonical,
+    build_canonical,
+    corrected_only,
+    open_positions,
+)
+from pipeline.avatar.posed import initial_scales
 from pipeline.avatar.residual import regions
 from pipeline.avatar.surface import Surface, build_surface, plane_regions
 from pipeline.body import BodyModel, Identity
@@ -16,6 +25,14 @@ from pipeline.body import BodyModel, Identity
 def finest_level(architecture: Architecture, splits: Sequence[Tensor]) -> int:
     """The midpoint subdivisions of the finest mesh: none where edges are split instead."""
     return 0 if splits else architecture.subdivisions
+
+
+def inset(mesh: Canonical, architecture: Architecture) -> Canonical:
+    """The mesh moved into itself, see ``Architecture.inset``."""
+    if architecture.inset == 0:
+        return mesh
+    depth = architecture.inset * initial_scales(mesh, architecture)[:, :2].mean(1, keepdim=True)
+    return dataclasses.replace(mesh, vertices=mesh.vertices - depth * mesh.frames[..., 2])
 
 
 def build_surfaces(
@@ -44,6 +61,7 @@ def build_surfaces(
         meshes = [build_canonical(body, identity, level, vertex_ids) for level in range(finest + 1)]
     if architecture.correctives == "face_and_hands":
         meshes = [corrected_only(mesh, *HEAD, *HANDS) for mesh in meshes]
+    meshes = [inset(mesh, architecture) for mesh in meshes]
     places = meshes[-1].vertices
     if architecture.plane_pose == "open":
         places = open_positions(body, identity, finest, vertex_ids, splits)

@@ -30,6 +30,7 @@ Texels = Annotated[int, Field(ge=2, le=4096)]
 Channels = Annotated[int, Field(ge=1, le=8192)]
 Metres = Annotated[float, Field(ge=0, le=10)]
 Size = Annotated[float, Field(gt=0, le=1000)]
+Inset = Annotated[float, Field(ge=0, le=10)]
 Opacity = Annotated[float, Field(gt=0, lt=1)]
 Deviation = Annotated[float, Field(ge=0, le=10)]
 Frequencies = Annotated[int, Field(ge=0, le=32)]
@@ -114,7 +115,10 @@ class TrainSettings:
     offset_unit: Metres = setting(0.04, "metres that a static offset of 1 stands for")
     pose_offset_unit: Metres = setting(0.01, "metres that a pose-dependent offset of 1 stands for")
     scale: Size = setting(0.55, "initial standard deviation of a Gaussian, in mean edge lengths")
-    thickness: Size = setting(0.5, "initial standard deviation along the normal, in those along the surface")
+    thickness: Size = setting(0.4, "initial standard deviation along the normal, in those along the surface")
+    inset: Inset = setting(
+        0.7, "how far inside the body's surface Gaussians begin, in their standard deviations along it"
+    )
     opacity: Opacity = setting(0.999, "of every Gaussian, or to begin with")
     learn_opacity: bool = setting(False, "each Gaussian has an opacity of its own")
     learn_identity: bool = setting(False, "betas and joint offsets move with the poses")

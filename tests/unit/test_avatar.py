@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 import safetensors
@@ -10,7 +11,7 @@ from safetensors.torch import save_file
 
 from pipeline.avatar import Architecture, Avatar, build_canonical, load_avatar, pose_features, save_avatar
 from pipeline.avatar.canonical import dilate, tangent_frames, tangent_spacing
-from pipeline.body import Identity, Pose, mean_identity, posed_vertices, vertex_normals
+from pipeline.body import Identity, Pose, mean_identity, posed_vertices, rasterize, vertex_normals
 from pipeline.clip.camera import facing_camera
 from pipeline.errors import UserError
 from pipeline.splat import render
@@ -53,6 +54,23 @@ def awakened(avatar: Avatar) -> Avatar:
     for parameter in avatar.parameters():
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=generator)
     return avatar
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180])
+def test_the_silhouette_of_an_inset_avatar_is_nearer_to_the_bodys(body, degrees):
+    identity, turned = mean_identity(body), torch.zeros(55, 3)
+    turned[0, 1] = math.radians(degrees)
+    pose = Pose(turned, torch.zeros(5), torch.tensor([0.0, 0.3, -4.0]))
+    camera = facing_camera(200, 200, focal=400.0)
+    body_covers = rasterize(camera, posed_vertices(body, identity, pose), body.faces).covered.sum()
+
+    def too_much(inset: float) -> float:
+        architecture = dataclasses.replace(SMALL, subdivisions=0, inset=inset)
+        avatar = Avatar(body, identity, torch.arange(len(body.v_template)), architecture)
+        with torch.no_grad():
+            return float(render(avatar.eval().gaussians(pose), camera).alpha.sum()) / body_covers - 1
+
+    assert too_much(0.0) > 0.1 and abs(too_much(0.7)) < 0.6 * too_much(0.0)
 
 
 def test_untrained_avatar_is_the_fitted_body(body, identity, avatar, kept):
