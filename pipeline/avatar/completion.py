@@ -30,7 +30,7 @@ from pipeline.texture.segments import Segments, find_segments
 
 ARMS = 1.0  # radians that they hang down while holes are looked for
 FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
-LEAST_OWN = 0.03  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
+LEAST_OWN = 0.06  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
 OWN, FREE = 0.8, 0.4  # distance more for a squared cosine of 1; from this one on any
 HAIR = 0.5  # share from which a place is hair
 DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope

@@ -172,15 +172,14 @@ def head_field(
     clear = 1 / (1 + (away.min(0) / CLEAR) ** 4)
     hair_like = 1 / (1 + np.exp(np.clip(8 * (away[1] - away[0]), -50, 50)))
     share = hair_share(segments, links, rows, hair_like, telling * clear)
-    fields = []
+    reach, fields = np.full(len(rows), HEAD_REACH), []
     for tone, like in zip(tones, (1 - hair_like, hair_like), strict=True):
-        source = telling * clear * like
-        mirrored = segments.mirrored[rows]
-        known = (source[mirrored] * segments.is_in(*HEAD)[mirrored])[:, None]
-        guessed = known * flat[mirrored] + (1 - known) * tone
-        reach = np.full(len(rows), HEAD_REACH)
-        fields.append(bent(links, guessed, flat[rows], source[rows], segments.spacing[rows], reach))
-    return fields[0] + share[:, None] * (fields[1] - fields[0]), share
+        source, guessed = (telling * clear * like)[rows], np.tile(tone, (len(rows), 1))
+        fields.append(bent(links, guessed, flat[rows], source, segments.spacing[rows], reach))
+    field = fields[0] + share[:, None] * (fields[1] - fields[0])
+    mirrored = segments.mirrored[rows]
+    better = (telling[mirrored] * segments.is_in(*HEAD)[mirrored] * (1 - telling[rows]))[:, None]
+    return field + better * (flat[mirrored] - field), share
 
 
 def head_tones(segments: Segments, flat: np.ndarray, telling: np.ndarray) -> np.ndarray | None:
@@ -203,8 +202,10 @@ def hair_share(
     hair_like: np.ndarray,  # [N]
     telling: np.ndarray,  # [N]
 ) -> np.ndarray:
-    """How likely each vertex of a head is hair, by colour where it tells, else by its segment: [M]."""
-    scalp = segments.is_in(SCALP)[rows].astype(np.float64)
+    """How likely each vertex of a head is hair, [M], by its colour or its mirror image's, or its segment."""
+    scalp, mirrored = segments.is_in(SCALP)[rows].astype(np.float64), segments.mirrored
+    better = segments.is_in(*HEAD)[mirrored] & (telling[mirrored] > telling)
+    telling, hair_like = (np.where(better, one[mirrored], one) for one in (telling, hair_like))
     hold = (segments.spacing[rows] / HAIRLINE) ** 2
     known = FIRM * telling[rows] ** 2
     values = (hold * scalp + known * hair_like[rows]) / (hold + known)
