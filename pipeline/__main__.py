@@ -15,7 +15,7 @@ from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
 from pipeline.errors import UserError, error_message
 from pipeline.run.job import open_job, run_stage
-from pipeline.run.process import leave_reason
+from pipeline.run.process import end_process, leave_reason
 from pipeline.run.stage import load_stages
 
 
@@ -83,4 +83,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_process(main())

@@ -12,7 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 from pipeline.config.request import Request
 from pipeline.config.workspace import REPOSITORY
@@ -86,6 +86,14 @@ def start_process(arguments: list[str], environment: Mapping[str, str], log: Pat
             stderr=out,
             preexec_fn=ending_with_this_process(),
         )
+
+
+def end_process(status: int) -> NoReturn:
+    """Ends this process at once: to take down torch and all that was loaded takes one to two seconds."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # closed, or the reader has gone
+            stream.flush()
+    os._exit(status)
 
 
 def leave_reason(message: str) -> None:

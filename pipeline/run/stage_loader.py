@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.run.process import ending_with_this_process, process_environment
+from pipeline.run.process import end_process, ending_with_this_process, process_environment
 
 OF_OPTIMIZERS = "torch._dynamo"  # the first one of a process loads it, which takes more than a second
 LAST_WORDS = 0.25  # seconds
@@ -121,7 +121,7 @@ def main(answers_to: int, functions: list[str]) -> int:
         functions: the stages' ``Stage.run``.
 
     Returns:
-        0, and in a copy the exit status of its stage.
+        0.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the stage hears it, too, and says that it stopped
     load(functions)
@@ -132,7 +132,7 @@ def main(answers_to: int, functions: list[str]) -> int:
             os.close(answers_to)
             if end_with_this is not None:
                 end_with_this()
-            return run_forked(json.loads(line))
+            end_process(run_forked(json.loads(line)))
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         os.write(answers_to, b"%d\n" % status)
     return 0

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -63,7 +64,9 @@ def test_a_loader_that_the_system_killed_is_done_without(toy, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     runner = StageRunner(request_of(toy))
     assert runner.run("gather", "ann", TOYS) is None
-    mine = ["pkill", "-9", "-P", str(os.getpid()), "-f", "pipeline.run.stage_loader"]
-    subprocess.run(mine, check=True)
+    mine = ["-P", str(os.getpid()), "-f", "pipeline.run.stage_loader"]
+    subprocess.run(["pkill", "-9", *mine], check=True)
+    while subprocess.run(["pgrep", *mine], check=False, stdout=subprocess.DEVNULL).returncode == 0:
+        time.sleep(0.02)
     assert runner.run("bend", "ann", TOYS[1:]) is None and toy.ran() == ["gather:ann", "bend:ann"]
     runner.close()
