@@ -245,8 +245,8 @@ def idle_change(study: Tradeoff, noise: float) -> str:
     if as_good["times"] > 0.95:
         sizes = sizes_of(study.base.settings)
         return f"{chance}: stay with {base['gaussians']:,.0f} Gaussians and {sizes}"
-    perceived = f"LPIPS×100 {100 * as_good['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
-    return f"{chance}: {as_good['result'].variant}, at {times(as_good)}, does as well in PSNR ({perceived})"
+    told = f"does as well in PSNR ({perceived(as_good, base)})"
+    return f"{chance}: {as_good['result'].variant}, at {times(as_good)}, {told}"
 
 
 def change(point: pd.Series, base: pd.Series) -> str:
@@ -256,7 +256,12 @@ def change(point: pd.Series, base: pd.Series) -> str:
     if level.parameter == GAUSSIANS:
         before, after = (f"{one['gaussians']:,.0f} Gaussians" for one in (base, point))
     told = after if after.startswith("with") else f"from {before} to {after}"
-    return f"{told}, at {times(point)}: {point['gain']:+.1f} dB"
+    return f"{told}, at {times(point)}: {point['gain']:+.1f} dB ({perceived(point, base)})"
+
+
+def perceived(point: pd.Series, base: pd.Series) -> str:
+    """A point's LPIPS beside the base's: what gains in PSNR may well be less sharp."""
+    return f"LPIPS×100 {100 * point['lpips_alex']:.1f}, was {100 * base['lpips_alex']:.1f}"
 
 
 def times(point: pd.Series) -> str:
