@@ -318,7 +318,7 @@ def run_record(context: Context, seconds: float) -> dict[str, Any]:
     """What differs between two equal runs: time, memory, machine."""
     return {
         "seconds": round(seconds, 3),
-        "cpu_seconds": round(time.process_time(), 3),  # of all threads, imports included
+        "cpu_seconds": round(time.process_time(), 3),  # of all threads, with what it imported itself
         "peak_memory_mib": peak_memory(),
         "host": platform.node(),
         "machine": platform.machine(),

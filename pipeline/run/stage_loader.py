@@ -21,11 +21,15 @@ from pipeline.run.process import end_process, ending_with_this_process, process_
 
 OF_OPTIMIZERS = "torch._dynamo"  # the first one of a process loads it, which takes more than a second
 LAST_WORDS = 0.25  # seconds
+GPUS = Path("/dev/nvidiactl"), Path("/dev/kfd")  # there with a driver of NVIDIA's or of AMD's
 
 
 def can_load_ahead() -> bool:
-    """Whether a process can be forked after its libraries were loaded, and a core is free to load them."""
-    return sys.platform == "linux" and (os.cpu_count() or 1) > 1
+    """Whether a process can be forked after its libraries were loaded, and a core is free to load them.
+
+    Not where there is a GPU: what a library has begun with its driver does not survive a fork.
+    """
+    return sys.platform == "linux" and (os.cpu_count() or 1) > 1 and not any(one.exists() for one in GPUS)
 
 
 class StageLoader:

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.config.request import parse_request
 from pipeline.run.process import run_stage_process
-from pipeline.run.stage_loader import StageLoader
+from pipeline.run.stage_loader import StageLoader, can_load_ahead
 from pipeline.run.stage_runner import StageRunner
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loaders are of Linux")
@@ -54,6 +54,13 @@ def test_lines_of_a_copy_go_where_those_of_a_process_go(toy, tmp_path, capfd):
     loader.close()
 
 
+def test_no_process_is_forked_beside_a_gpu(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    for there in (False, True):
+        monkeypatch.setattr("pipeline.run.stage_loader.GPUS", (tmp_path if there else tmp_path / "none",))
+        assert can_load_ahead() is not there
+
+
 def test_code_that_cannot_be_loaded_is_no_matter_until_it_is_needed(toy):
     loader = StageLoader(["no.such.module:run"])
     assert run_stage_process("gather", "ann", request_of(toy), start=loader.run) is None
@@ -62,6 +69,7 @@ def test_code_that_cannot_be_loaded_is_no_matter_until_it_is_needed(toy):
 
 def test_a_loader_that_the_system_killed_is_done_without(toy, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("pipeline.run.stage_loader.GPUS", ())
     runner = StageRunner(request_of(toy))
     assert runner.run("gather", "ann", TOYS) is None
     mine = ["-P", str(os.getpid()), "-f", "pipeline.run.stage_loader"]
