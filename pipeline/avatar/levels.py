@@ -28,7 +28,7 @@ def finest_level(architecture: Architecture, splits: Sequence[Tensor]) -> int:
 
 
 def inset(mesh: Canonical, architecture: Architecture) -> Canonical:
-    """The mesh moved into itself, see ``Architecture.inset``."""
+    """The finest mesh moved into itself, see ``Architecture.inset``; the gate looks at the body's own."""
     if architecture.inset == 0:
         return mesh
     depth = architecture.inset * initial_scales(mesh, architecture)[:, :2].mean(1, keepdim=True)
@@ -61,7 +61,7 @@ def build_surfaces(
         meshes = [build_canonical(body, identity, level, vertex_ids) for level in range(finest + 1)]
     if architecture.correctives == "face_and_hands":
         meshes = [corrected_only(mesh, *HEAD, *HANDS) for mesh in meshes]
-    meshes = [inset(mesh, architecture) for mesh in meshes]
+    meshes[-1] = inset(meshes[-1], architecture)
     places = meshes[-1].vertices
     if architecture.plane_pose == "open":
         places = open_positions(body, identity, finest, vertex_ids, splits)

@@ -138,6 +138,7 @@ def architecture(settings: TrainSettings, conditions: ClipConditions, expression
     remembered = {name: getattr(settings, name) for name in names}
     remembered["residual_parts"] = () if settings.residual_from == 1 else settings.residual_parts
     if settings.representation == "triplane":
+        remembered["inset"] = 0.0  # its meshes change on the way, and each would have another
         return Architecture(**remembered, pose_heads=settings.pose_heads_from < 1)
     remembered |= {"plane_resolution": 2, "plane_channels": 1}  # there are no planes
     features = signal_features(conditions.theta, conditions.expression, expressions)

@@ -47,7 +47,7 @@ PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose resid
 IGNORED = {
     "triplane": (
         "edge_pixels", "bases", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
-        "bases_learning_rate", "calm_from",
+        "bases_learning_rate", "calm_from", "inset",
     ),
     "bases": (
         "half_precision", "subdivide_from", "plane_resolution", "plane_channels", "width", "groups",
@@ -117,7 +117,7 @@ class TrainSettings:
     scale: Size = setting(0.55, "initial standard deviation of a Gaussian, in mean edge lengths")
     thickness: Size = setting(0.5, "initial standard deviation along the normal, in those along the surface")
     inset: Inset = setting(
-        0.7, "how far inside the body's surface Gaussians begin, in their standard deviations along it"
+        0.7, "how far inside the body's surface bases begin, in Gaussians' standard deviations along it"
     )
     opacity: Opacity = setting(0.999, "of every Gaussian, or to begin with")
     learn_opacity: bool = setting(False, "each Gaussian has an opacity of its own")

@@ -1,6 +1,7 @@
 """The GPU's benchmark: refused where there is none, and run on a pretended device."""
 
 import dataclasses
+import importlib
 import json
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from benchmarks import gpu, step
 from benchmarks.avatars import avatar_of
-from pipeline.avatar import Architecture, evidence
+from pipeline.avatar import Architecture
 from pipeline.clip.plan import read_plan
 from pipeline.device import moved
 from pipeline.splat import render
@@ -29,7 +30,7 @@ def drawn_elsewhere(gaussians, camera, backend="auto"):
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    for module in (gpu, step, objective, held_out, evidence):
+    for module in (gpu, step, objective, held_out, importlib.import_module("pipeline.splat.render")):
         monkeypatch.setattr(module, "render", drawn_elsewhere)
     plain = torch.optim.Adam
     monkeypatch.setattr(torch.optim, "Adam", lambda *given, fused, **more: plain(*given, **more))
