@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from pipeline.config.workspace import REPOSITORY
 
 
@@ -19,6 +21,7 @@ def test_a_run_makes_every_stage_and_a_second_run_makes_none(toy):
     assert toy.ran() == []
 
 
+@pytest.mark.slow
 def test_two_subjects_at_once(toy):
     assert toy.doit("subject=ann,bob", options=("-n", "2", "-P", "thread")).returncode == 0
     assert sorted(toy.ran()) == sorted(
@@ -146,6 +149,7 @@ def test_missing_footage_says_what_to_fetch_and_names_a_subject_that_runs(toy):
     )
 
 
+@pytest.mark.slow
 def test_a_killed_stage_goes_on_where_it_was(toy):
     toy.doit("bend:ann")
     killed = toy.stage("paint", "ann", "paint.iterations=40", "paint.rate=0.05")

@@ -24,6 +24,7 @@ def many(toy):
     return toy
 
 
+@pytest.mark.slow
 def test_a_dataset_runs_all_its_subjects_with_its_settings(many):
     run = many.doit("dataset=one,two", options=("-n", "2", "-P", "thread"))
     assert run.returncode == 0, run.stderr
@@ -36,6 +37,7 @@ def test_a_dataset_runs_all_its_subjects_with_its_settings(many):
     assert "ann 4.0" in (many.store / "cat" / "paint" / "latest" / "painted.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_end_of_a_run_says_who_failed_where_and_why(many):
     many.subject("dog", 'dataset = "one"\n[source]\npath = "sources/ann.txt"\n[bend]\nfail = "user"\n')
     many.subject("eel", 'dataset = "two"\n[source]\npath = "sources/gone.txt"\n')

@@ -43,6 +43,7 @@ def test_its_result_is_known_by_the_content_of_the_file_that_drives_it(toy):
     assert toy.ran() == ["paint:ann"]
 
 
+@pytest.mark.slow
 def test_what_another_subject_made_is_made_first_and_known_by_its_content(toy):
     words = ("sing", "subject=ann", "tune=subject:bob")
     assert toy.doit(*words).returncode == 0
@@ -67,6 +68,7 @@ def test_a_subject_whose_footage_is_gone_lends_what_the_store_has(toy):
     assert run.returncode != 0 and "nobody" in run.stderr and "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_a_clip_that_is_named_is_made_a_subject_of_its_own(toy):
     clip = toy.root / "dance.txt"
     clip.write_text("jig ")
@@ -80,6 +82,7 @@ def test_a_clip_that_is_named_is_made_a_subject_of_its_own(toy):
     assert not (toy.store / "dance" / "paint").exists()
 
 
+@pytest.mark.slow
 def test_a_clip_with_a_subjects_name_and_other_footage_is_refused(toy):
     for name, known in (("bob", "there is a subject 'bob'"), ("dance", "the store's 'dance'")):
         clip = toy.root / "first" / f"{name}.txt"

@@ -101,6 +101,7 @@ def bytes_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in times}
 
 
+@pytest.mark.slow
 def test_the_command_in_the_message_makes_the_damaged_version_again(toy):
     toy.doit("subject=ann", "bend.angle=2")
     folder = (toy.store / "ann" / "bend" / LATEST).resolve()

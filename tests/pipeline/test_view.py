@@ -143,6 +143,7 @@ def run_view(*words, folder):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_avatar_that_comes_with_the_project_is_shown_and_ctrl_c_ends_it(tmp_path):
     started = run_view(f"subject={SHIPPED}", "port=0", folder=tmp_path)
     try:
@@ -203,6 +204,7 @@ def changes(page):
     yield "reset", lambda: page.click(".reset")
 
 
+@pytest.mark.slow
 def test_the_file_shows_an_avatar_that_can_be_moved(file):
     with browser(*SOFTWARE_GL) as started:
         page, wrong = opened(started, file.as_uri())
@@ -228,6 +230,7 @@ def test_without_webgl_the_file_says_so_and_shows_the_film(file):
         assert not [one for one in wrong if "WebGL" not in one]
 
 
+@pytest.mark.slow
 def test_the_served_page_follows_a_training(workspace, body):
     with serving(workspace) as server, browser(*SOFTWARE_GL) as started:
         page, wrong = opened(started, server.url, allowed=(server.url, "data:"))

@@ -59,6 +59,7 @@ def test_a_task_of_someone_unknown_says_what_is_missing(toy, task):
     assert "subject=nobody" in said and "source=CLIP.mp4" in said
 
 
+@pytest.mark.slow
 def test_stored_subjects_are_checked_and_deleted_though_nothing_describes_them(toy):
     assert toy.doit("subject=ann").returncode == 0
     (toy.data / "subjects" / "ann.toml").unlink()

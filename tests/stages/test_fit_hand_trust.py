@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from stages.fit.hand_trust import trusted_hands
 from stages.fit.observations import observe
@@ -101,6 +102,7 @@ def test_a_hand_without_its_wrist_leaves_the_arms(model):
     assert cropped.mask[:, 15].all() and not cropped.mask[:, [17, 19, 21, 33]].any()
 
 
+@pytest.mark.slow
 def test_hands_of_a_cropped_mannequin_are_told_from_failures(model):
     """Against the truth: most good hands are kept, though half of them are cut off, and no others."""
     right, kept = [], []

@@ -80,6 +80,7 @@ def sfm_scene(folder: Path, **settings: object):
     return context, Clip(Path("clip.mp4"), WIDTH, HEIGHT, 25.0, 12), detected, truth
 
 
+@pytest.mark.slow
 def test_a_moving_camera_is_found_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     context, clip, detected, truth = sfm_scene(tmp_path, focal=FOCAL / WIDTH)
     assert unexplained_by_rotation(context.output, range(12), 25.0, MATRIX) > ROTATION_ONLY

@@ -77,6 +77,7 @@ def joint_error(model, clip, fitted, poses):
     return float((joints[:, :22] - clip.joints[:, :22])[..., :2].norm(dim=-1).mean())
 
 
+@pytest.mark.slow
 def test_eight_pictures_from_all_sides_are_fitted_as_well_as_without_smoothing(model, turning):
     settings = FitSettings(iterations=40, face="off")
     keypoints, cameras = turning.keypoints, turning.cameras

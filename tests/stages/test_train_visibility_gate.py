@@ -142,6 +142,7 @@ def test_one_training_frame_is_enough_for_a_threshold(subject, tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", [{}, {"gate_every": 100}], ids=["a look after it", "none after it"])
 def test_killed_after_the_gate_closed_and_rerun_gives_the_same_bytes(subject, tmp_path, monkeypatch, looks):
     whole = context_for(subject, tmp_path / "whole", **LATE | looks)

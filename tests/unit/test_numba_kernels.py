@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from pipeline.config.workspace import REPOSITORY
 
 PROGRAM = """
@@ -15,6 +17,7 @@ with threads(1):
 """
 
 
+@pytest.mark.slow
 def test_numbas_pool_does_not_set_torchs_threads_when_it_starts():
     words = [sys.executable, "-c", PROGRAM]
     run = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, check=True)
