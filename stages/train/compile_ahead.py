@@ -17,7 +17,7 @@ from pipeline.body import Pose, draw_mesh, load_body, mean_identity
 from pipeline.clip.camera import Camera, facing_camera
 from pipeline.config.workspace import open_workspace
 from pipeline.metrics import ssim_loss
-from pipeline.splat import render
+from pipeline.splat import picture_sums, render
 
 SIDE = 16  # pixels
 TRANSL = (0.0, 0.4, -3.0)  # metres: before the camera
@@ -53,6 +53,7 @@ def take_step(sizes: Architecture) -> None:
         baked = bake(avatar.eval())
         for animate in (avatar.gaussians, baked.gaussians):
             render(animate(pose, 0.5), camera)
+        picture_sums(baked.gaussians(pose), camera, torch.zeros(SIDE, SIDE, 4))  # as evidence asks them
 
 
 def learn(avatar: Avatar, pose: Pose, camera: Camera, rows: Tensor | None) -> None:
