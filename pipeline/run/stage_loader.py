@@ -1,6 +1,6 @@
 """Stages that start at once: one process loads the code of all that are still to run, and forks for each.
 
-Loading a stage's code takes three to five seconds, most of it torch's. While the first stage works, which
+Loading a stage's code takes two to four seconds, most of it torch's. While the first stage works, which
 keeps one of two cores idle for most of its time, this process loads what the others need, once for all.
 """
 

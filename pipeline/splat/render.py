@@ -79,7 +79,7 @@ def picture_sums(
 ) -> tuple[Tensor, Tensor]:
     """The sums over the pixels of each Gaussian's blending weight times a picture, and of the weight alone.
 
-    Equal to ``plain_picture_sums``, in a third of its time on the CPU.
+    Equal to ``plain_picture_sums``, in 0.4 of its time on the CPU.
 
     Args:
         gaussians: N of them, in world coordinates.
