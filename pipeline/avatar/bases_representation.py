@@ -12,6 +12,7 @@ import dataclasses
 import torch
 from torch import Tensor, nn
 
+from pipeline.avatar.color_bounds import ANYWHERE, ColorBounds
 from pipeline.avatar.driving_signal import DrivingSignal, fit_driving_signal, signal_features
 from pipeline.avatar.representation import (
     BakedRepresentation,
@@ -141,9 +142,13 @@ class BasesRepresentation(Representation):
         self.bases[~seen] = 0.0
 
     @torch.no_grad()
-    def hold_colors(self, low: Tensor, high: Tensor) -> None:
-        """Keeps colours between two, each [N, 3], logits as ``color`` has them."""
-        self.color.clamp_(low, high)
+    def hold_colors(self, bounds: ColorBounds, base_color: Tensor) -> None:
+        """Keeps colours within bounds; ``base_color``, [N, 3] logits, is what ``color`` is added to."""
+        rows = torch.nonzero(bounds.around < ANYWHERE)[:, 0]
+        color = torch.sigmoid(base_color[rows] + self.color[rows])
+        held = bounds.pick(rows).held(color)
+        moved = held != color
+        self.color[rows] = torch.where(moved, torch.logit(held) - base_color[rows], self.color[rows])
 
     @torch.no_grad()
     def take_completion(self, rows: Tensor, completed: Decoded, base_color: Tensor, share: Tensor) -> bool:

@@ -19,21 +19,25 @@ from torch import Tensor
 
 from pipeline.avatar.avatar import Avatar
 from pipeline.avatar.canonical import dilate
+from pipeline.avatar.color_bounds import ANYWHERE, BRIGHTEST, DARKEST, ColorBounds
 from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.holes import around_holes
 from pipeline.avatar.representation import Decoded
+from pipeline.avatar.spared import Shown, with_sizes_spared
 from pipeline.avatar.surface import Surface
 from pipeline.body import Pose
 from pipeline.orbit_cameras import relaxed_pose
 from pipeline.texture.completion import color_field, complete_colors, complete_log_scales
-from pipeline.texture.segments import Segments, find_segments
+from pipeline.texture.segments import HEAD, Segments, find_segments
 
 ARMS = 1.0  # radians that they hang down while holes are looked for
 FLAT = -1.5  # log scale along the normal of what is guessed: thick ones stand out around every silhouette
-LEAST_OWN = 0.06  # how far from its segment's a colour may lie, in [0, 1], where frames saw the edge alone
-OWN, FREE = 0.8, 0.4  # distance more for a squared cosine of 1; from this one on any
+ON_HEADS, ELSEWHERE = (0.02, 0.25, 0.4), (0.06, 1.0, 0.8)
+"""How far from its segment's a colour may lie, in [0, 1]: where frames saw the edge alone, of what the part
+usually differs by, and for a squared cosine of 1."""
+
+FREE = 0.4  # squared cosine from which on a colour may lie anywhere
 HAIR = 0.5  # share from which a place is hair
-DARKEST, BRIGHTEST = 0.02, 0.98  # colours stay where the sigmoid still has a slope
 
 
 def surface_segments(surface: Surface) -> Segments:
@@ -51,12 +55,13 @@ def complete_color_logits(surface: Surface, evidence: Evidence) -> Tensor:
 
 
 @torch.no_grad()
-def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
+def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = None) -> None:
     """Completes an avatar in place; to be called once, after training.
 
     Args:
         avatar: trained.
         evidence: of its ungated Gaussians, N, see ``covering``.
+        shown: poses it in frames that are not to be spoilt (``with_sizes_spared``); none are asked if None.
     """
     decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
@@ -65,7 +70,10 @@ def complete_avatar(avatar: Avatar, evidence: Evidence) -> None:
         return
     segments = surface_segments(decoded.surface)
     colored = with_completed_colors(decoded, segments, evidence)
-    avatar.take_completion(rows, closed(avatar, colored, segments, evidence))
+    completed = closed(avatar, colored, segments, evidence)
+    if shown is not None:
+        completed = with_sizes_spared(colored, completed, shown)
+    avatar.take_completion(rows, completed)
 
 
 def closed(avatar: Avatar, decoded: Decoded, segments: Segments, evidence: Evidence) -> Decoded:
@@ -105,26 +113,26 @@ def with_completed_colors(decoded: Decoded, segments: Segments, evidence: Eviden
 
 
 @torch.no_grad()
-def calm_colors(decoded: Decoded, evidence: Evidence) -> tuple[Tensor, Tensor]:
-    """Logits of the darkest and the brightest colour that evidence leaves each Gaussian, each [N, 3].
+def calm_colors(decoded: Decoded, evidence: Evidence) -> ColorBounds:
+    """The bounds within which evidence leaves the colours of each Gaussian.
 
-    Both lie about what its segment shows there, as far from it as its part of the body usually is (a checked
+    They lie about what its segment shows there, as far from it as its part of the body usually is (a checked
     shirt is farther than skin), and farther the more squarely frames saw it: what they saw from its edge
-    alone has the colours of whatever stands at that edge of the person. Hair is free: a few Gaussians, beyond
-    the horizon, make its soft rim.
+    alone has the colours of whatever stands at that edge of the person. A head's are narrower: eyes and mouth
+    are what it usually differs by, and its sides have none.
     """
-    none = torch.full_like(decoded.color_logit, torch.inf)
+    free = torch.full_like(evidence.square, ANYWHERE)
     color, telling, normals = _arrays(torch.sigmoid(decoded.color_logit), evidence.source, evidence.normals)
     if not (telling > 0).any():
-        return -none, none
+        return ColorBounds(torch.zeros_like(decoded.color_logit), free, torch.isnan(free))
     segments = surface_segments(decoded.surface)
-    field, hair = (torch.from_numpy(one).to(none) for one in color_field(segments, color, telling, normals))
+    field, hair = (torch.from_numpy(one).to(free) for one in color_field(segments, color, telling, normals))
     apart = (torch.sigmoid(decoded.color_logit) - field).abs().amax(1)
-    usual = _group_means(apart, evidence.source, torch.from_numpy(segments.part).to(none.device))
-    around = (LEAST_OWN + usual + OWN * evidence.square)[:, None]
-    bounds = [torch.logit((field + side * around).clamp(DARKEST, BRIGHTEST)) for side in (-1, 1)]
-    free = ((hair > HAIR) | (evidence.square > FREE))[:, None]
-    return torch.where(free, -none, bounds[0]), torch.where(free, none, bounds[1])
+    usual = _group_means(apart, evidence.source, torch.from_numpy(segments.part).to(free.device))
+    head = torch.from_numpy(segments.is_in(*HEAD)).to(free.device)
+    least, share, own = (torch.where(head, *pair) for pair in zip(ON_HEADS, ELSEWHERE, strict=True))
+    around = least + share * usual + own * evidence.square
+    return ColorBounds(field, torch.where(evidence.square > FREE, free, around), hair > HAIR)
 
 
 def _group_means(values: Tensor, weights: Tensor, group: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from stages.train.settings import TrainSettings
 
 STAGE = Stage(
     name="train",
-    version=9,
+    version=10,
     settings=TrainSettings,
     run="stages.train.run:run",
     needs={

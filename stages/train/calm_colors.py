@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.avatar.bases_representation import BasesRepresentation
+from pipeline.avatar.color_bounds import ANYWHERE, ColorBounds
 from pipeline.avatar.completion import calm_colors
 from pipeline.clip.frames import spread_from_start
 from stages.train.frame_evidence import evidence_of
 from stages.train.loop import Hook, Trainer
 
-LARGEST = 1e4  # a logit that no colour reaches
 EVERY = 2  # of the frames that completion asks
 
 
@@ -27,11 +27,12 @@ class CalmColors(nn.Module, Hook):
     """Holds weakly seen colours near their segment's from one iteration on.
 
     Attributes:
-        low, high: [N, 3], the bounds of what is added to the base colour, logits.
+        field, around, hair: of N Gaussians, see ``ColorBounds``.
     """
 
-    low: Tensor  # [N, 3]
-    high: Tensor  # [N, 3]
+    field: Tensor  # [N, 3]
+    around: Tensor  # [N]
+    hair: Tensor  # [N]
 
     def __init__(self, base_color: Tensor, first: int):
         """Holds nothing yet.
@@ -42,8 +43,9 @@ class CalmColors(nn.Module, Hook):
         """
         super().__init__()
         self._first = first
-        self.register_buffer("low", torch.full_like(base_color, -LARGEST))
-        self.register_buffer("high", torch.full_like(base_color, LARGEST))
+        self.register_buffer("field", torch.zeros_like(base_color))
+        self.register_buffer("around", torch.full_like(base_color[:, 0], ANYWHERE))
+        self.register_buffer("hair", torch.zeros_like(base_color[:, 0], dtype=torch.bool))
 
     def on_step(self, trainer: Trainer, terms: dict[str, float]) -> None:
         """Looks once what is seen weakly, then holds its colours after every step."""
@@ -51,7 +53,8 @@ class CalmColors(nn.Module, Hook):
             self._look(trainer)
         representation = trainer.avatar.representation
         if trainer.iteration >= self._first and isinstance(representation, BasesRepresentation):
-            representation.hold_colors(self.low, self.high)
+            bounds = ColorBounds(self.field, self.around, self.hair)
+            representation.hold_colors(bounds, trainer.avatar.base_color)
 
     def _look(self, trainer: Trainer) -> None:
         avatar, data, count = trainer.avatar.eval(), trainer.data, trainer.settings.color_frames // EVERY
@@ -59,8 +62,7 @@ class CalmColors(nn.Module, Hook):
         evidence = evidence_of(avatar, trainer.poses, data, captured, made)
         with torch.no_grad():
             decoded = avatar.decode()
-        rows = decoded.surface.pick(torch.arange(len(self.low), device=avatar.device))
-        for kept, bound in zip((self.low, self.high), calm_colors(decoded, evidence), strict=True):
-            away = (bound - avatar.base_color[rows]).clamp(-LARGEST, LARGEST)
-            kept.index_copy_(0, rows, away)
+        rows = decoded.surface.pick(torch.arange(len(self.around), device=avatar.device))
+        bounds = calm_colors(decoded, evidence)
+        self.field[rows], self.around[rows], self.hair[rows] = bounds.field, bounds.around, bounds.hair
         avatar.train()

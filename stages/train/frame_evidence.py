@@ -10,6 +10,7 @@ from pipeline.avatar import Avatar
 from pipeline.avatar.canonical import dilate
 from pipeline.avatar.completion import complete_avatar
 from pipeline.avatar.evidence import Evidence, covering, gather_evidence
+from pipeline.avatar.representation import Decoded
 from pipeline.clip.frames import spread_from_start
 from pipeline.clip.views import View
 from pipeline.device import moved
@@ -40,15 +41,20 @@ def evidence_of(
     with torch.no_grad():
         decoded = covering(avatar.decode()) if cover else avatar.decode()
 
-    def shown(frames: tuple[int, ...]) -> Iterator[tuple[Gaussians, View]]:
-        for frame in frames:
-            seconds = data.clip.seconds.get(frame)
-            with torch.no_grad():
-                gaussians = avatar.pose(decoded, poses(frame), time=seconds).gaussians
-            yield gaussians, moved(data.view(frame), avatar.device)
+    def gathered(frames: tuple[int, ...]) -> Evidence:
+        return gather_evidence(in_frames(avatar, decoded, poses, data, frames), decoded.surface)
 
-    found = gather_evidence(shown(captured), decoded.surface)
-    return found.filled(gather_evidence(shown(made), decoded.surface)) if made else found
+    return gathered(captured).filled(gathered(made)) if made else gathered(captured)
+
+
+def in_frames(
+    avatar: Avatar, decoded: Decoded, poses: PoseRefinement, data: TrainingData, frames: tuple[int, ...]
+) -> Iterator[tuple[Gaussians, View]]:
+    """For each frame what was decoded of an avatar in its pose, and the frame, on the avatar's device."""
+    for frame in frames:
+        with torch.no_grad():
+            posed = avatar.pose(decoded, poses(frame), time=data.clip.seconds.get(frame))
+        yield posed.gaussians, moved(data.view(frame), avatar.device)
 
 
 def settle_unseen(
@@ -75,7 +81,9 @@ def settle_unseen(
     avatar.trust.index_copy_(0, rows, evidence.together)
     avatar.representation.forget_unseen(avatar.trust.amax(1) > 0)
     if settings.unseen in ("completed", "base"):
-        complete_avatar(avatar, evidence)
+        complete_avatar(
+            avatar, evidence, lambda decoded: in_frames(avatar, decoded, poses, data, captured[::4])
+        )
     if settings.unseen == "nothing":
         leave_seen(avatar)
     return evidence
