@@ -33,6 +33,7 @@ class Architecture:
         pose_heads: whether there are any; one who never moves needs none.
         representation: ``"triplane"`` or ``"bases"``; the sizes of planes and heads are the triplane's.
         bases: K, of the bases.
+        bends: how many of them are bends, see ``driving_signal.py``.
         plane_pose: whose rest mesh tells the triplane's coordinates: ``"own"``, the identity's in T pose, or
             ``"open"``, the mean identity's with legs apart and the mouth open (see ``open_positions``).
         learn_identity: betas and joint offsets change in training (see ``identity_change.py``).
@@ -60,6 +61,7 @@ class Architecture:
     residual_moves: bool = False
     representation: str = "triplane"
     bases: int = 0
+    bends: int = 0
     plane_deviation: float = 0.01
     plane_pose: str = "own"
     learn_identity: bool = False

@@ -127,7 +127,7 @@ class Avatar(nn.Module):
         pose = 6 * (len(canonical.joints) - 1)
         if sizes.representation == "bases":
             count, expressions = len(self.surfaces[-1].canonical), canonical.expression_directions.shape[-1]
-            return BasesRepresentation(count, sizes.bases, pose, expressions, sizes.offset_unit)
+            return BasesRepresentation(count, sizes.bases, pose, expressions, sizes.offset_unit, sizes.bends)
         parts = tuple(region.part for region in self.surfaces[0].residual)
         return TriplaneRepresentation(sizes, len(self.boxes), pose, parts, seed, self.half_precision)
 

@@ -48,7 +48,9 @@ class BasesRepresentation(Representation):
     signal_components: Tensor
     signal_limits: Tensor
 
-    def __init__(self, count: int, bases: int, pose: int, expressions: int, offset_unit: float):
+    def __init__(
+        self, count: int, bases: int, pose: int, expressions: int, offset_unit: float, bends: int = 0
+    ):
         """Zeros: the fitted body in its base colours.
 
         Args:
@@ -57,9 +59,10 @@ class BasesRepresentation(Representation):
             pose: length of theta.
             expressions: of the body.
             offset_unit: metres that an offset of 1 stands for.
+            bends: how many of the bases are bends, see ``DrivingSignal.bent``.
         """
         super().__init__()
-        self._expressions, self._offset_unit = expressions, offset_unit
+        self._expressions, self._offset_unit, self._bends = expressions, offset_unit, bends
         for name in ("offset", "log_scale", "color"):
             self.register_parameter(name, nn.Parameter(torch.zeros(count, 3)))
         self.bases = nn.Parameter(torch.zeros(count, 6 * bases))
@@ -115,7 +118,8 @@ class BasesRepresentation(Representation):
         Raises:
             ValueError: the clip has fewer directions than there are bases.
         """
-        found = fit_driving_signal(signal_features(clip.theta, clip.expression, self._expressions), len(self))
+        features = signal_features(clip.theta, clip.expression, self._expressions)
+        found = fit_driving_signal(features, len(self) - self._bends).bent(self._bends)
         if len(found) < len(self):
             raise ValueError(f"the clip drives {len(found)} bases, not {len(self)}")
         self.signal_mean.copy_(found.mean)

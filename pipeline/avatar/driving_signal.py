@@ -2,6 +2,10 @@
 
 A direction has unit variance over the training frames. Outside of what these showed, the signal stays at the
 edge of their range: a dance on the avatar of a head clip stays calm.
+
+Linear in pose and face is too little for a mouth that opens wide. So the strongest directions may have
+*bends*: the same direction once more, at 0 on one side of ``BEND_AT`` and linear beyond. A bend is a
+direction whose least and greatest value lie on one side of the mean, so nothing else has to know of it.
 """
 
 from __future__ import annotations
@@ -16,6 +20,8 @@ from pipeline.finite import require_finite
 
 LEAST = 1e-3  # standard deviation of a direction that counts: a twentieth of a degree, or of an expression's
 SLACK = 0.1  # of the training frames' range, on either side of it
+BEND_AT = 0.7  # standard deviations from the mean at which a bend begins to act
+BEND_REACH = 0.3  # standard deviations beyond, that the clip has to reach
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +43,28 @@ class DrivingSignal:
         return len(self.components)
 
     def __call__(self, features: Tensor) -> Tensor:
-        """The signal of one frame, [D] -> [K]."""
-        signal = self.components @ (features - self.mean)
-        return torch.minimum(torch.maximum(signal, self.limits[0]), self.limits[1])
+        """The signal of one frame, [D] -> [K]; 0 at the mean."""
+        signal, (low, high) = self.components @ (features - self.mean), self.limits
+        # A bend's values all lie to one side of the mean: what it has there is taken off.
+        return torch.minimum(torch.maximum(signal, low), high) - low.clamp_min(0) - high.clamp_max(0)
+
+    @property
+    def bends(self) -> int:
+        """How many of the K are bends; they are the last ones."""
+        return int(((self.limits[0] > 0) | (self.limits[1] < 0)).sum())
+
+    def bent(self, most: int) -> DrivingSignal:
+        """The signal with bends behind it, those of the strongest direction first.
+
+        There are fewer than asked for where the clip does not reach far enough from its mean.
+        """
+        low, high = self.limits
+        beyond = torch.stack([high, -low], 1) >= BEND_AT + BEND_REACH
+        rows, sides = beyond.nonzero()[:most].T
+        at, end = torch.full_like(low[rows], BEND_AT), self.limits.flip(0)[sides, rows]
+        bends = torch.where(sides == 0, torch.stack([at, end]), torch.stack([end, -at]))
+        components = torch.cat([self.components, self.components[rows]])
+        return DrivingSignal(self.mean, components, torch.cat([self.limits, bends], 1))
 
 
 def signal_features(

@@ -46,7 +46,7 @@ Effort = Annotated[float, Field(gt=0, le=1000)]
 PLANNED_RESIDUALS = ("face", "left_hand", "right_hand")  # the parts whose residuals the plan decides
 IGNORED = {
     "triplane": (
-        "edge_pixels", "bases", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
+        "edge_pixels", "bases", "bends", "color_learning_rate", "scale_learning_rate", "offset_learning_rate",
         "bases_learning_rate", "calm_from", "inset",
     ),
     "bases": (
@@ -99,6 +99,11 @@ class TrainSettings:
         16,
         "most linear bases, driven by pose and face: one for 8 training frames, and none for a direction "
         "that the clip does not move in",
+    )
+    bends: BasesCount = setting(
+        8,
+        "most bases besides, which begin to act at some distance to one side of the mean, the strongest "
+        "directions' first; none in clips of under 100 training frames",
     )
     edge_pixels: EdgePixels | None = setting(
         None,
@@ -308,6 +313,7 @@ def apply_plan(settings: TrainSettings, plan: Plan) -> TrainSettings:
         face=settings.face if plan.on("face_loss") else 0.0,
         gate=settings.gate and plan.on("visibility_gate"),
         bases=settings.bases if plan.on("pose_heads") else 0,
+        bends=settings.bends if plan.on("pose_heads") else 0,
     )
     return for_bases(applied) if settings.representation == "bases" else applied
 

@@ -1,9 +1,11 @@
 """The signal that drives linear bases: principal directions of the clip, clamped to what it showed."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from pipeline.avatar.driving_signal import SLACK, fit_driving_signal, signal_features
+from pipeline.avatar.driving_signal import BEND_AT, SLACK, fit_driving_signal, signal_features
 from pipeline.finite import NotFiniteError
 
 
@@ -46,6 +48,30 @@ def test_signal_stays_near_what_the_frames_showed():
         driven = signal(known[0] + far)
         assert bool((driven <= values.amax(0) + 1.01 * SLACK * span).all())
         assert bool((driven >= values.amin(0) - 1.01 * SLACK * span).all())
+
+
+def test_bends_are_zero_up_to_where_they_begin_and_then_linear():
+    known = features(200)
+    plain, bent = fit_driving_signal(known, 2), fit_driving_signal(known, 2).bent(8)
+    assert len(bent) == 6 and bent.bends == 4 and plain.bends == 0
+    for row in known:
+        straight = plain(row)
+        beyond = torch.stack([(straight - BEND_AT).clamp_min(0), (straight + BEND_AT).clamp_max(0)], 1)
+        torch.testing.assert_close(bent(row), torch.cat([straight, beyond.flatten()]))
+    assert torch.equal(bent(bent.mean), torch.zeros(6))
+
+
+def test_the_strongest_directions_bend_first():
+    signal = fit_driving_signal(features(200), 2)
+    assert torch.equal(signal.bent(2).components, signal.components[[0, 1, 0, 0]])
+    assert torch.equal(signal.bent(0).limits, signal.limits)
+
+
+def test_a_clip_that_hardly_leaves_its_mean_has_no_bends():
+    near = 5 + torch.tensor([1.0, -1, 1, -1, 1, -1])[:, None] * torch.ones(9) * 0.1
+    short = dataclasses.replace(fit_driving_signal(near, 1), limits=torch.tensor([[-0.9], [0.9]]))
+    assert short.bent(8).bends == 0
+    assert fit_driving_signal(torch.ones(20, 9), 8).bent(8).bends == 0
 
 
 @pytest.mark.parametrize(("frames", "count"), [(1, 0), (2, 1), (3, 2)])

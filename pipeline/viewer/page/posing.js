@@ -122,7 +122,7 @@ const Posing = (() => {
     return found;
   }
 
-  // Pose and expression along the clip's principal directions, within what it showed: [B].
+  // Pose and expression along the clip's principal directions, within what it showed, 0 at its mean: [B].
   function drivingSignal(avatar, local, expression) {
     const { mean, components, limits } = avatar.signal, told = new Float64Array(mean.length);
     for (let j = 1; j < local.length; j++) for (let r = 0; r < 3; r++) for (let c = 0; c < 2; c++) {
@@ -133,7 +133,8 @@ const Posing = (() => {
     for (let b = 0; b < found.length; b++) {
       let sum = 0;
       for (let d = 0; d < told.length; d++) sum += components[b * told.length + d] * (told[d] - mean[d]);
-      found[b] = Math.min(Math.max(sum, limits[b]), limits[found.length + b]);
+      const low = limits[b], high = limits[found.length + b];
+      found[b] = Math.min(Math.max(sum, low), high) - Math.max(low, 0) - Math.min(high, 0);
     }
     return found;
   }
