@@ -23,7 +23,7 @@ from pipeline.avatar.color_bounds import ANYWHERE, BRIGHTEST, DARKEST, ColorBoun
 from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.holes import around_holes
 from pipeline.avatar.representation import Decoded
-from pipeline.avatar.spared import Shown, with_sizes_spared
+from pipeline.avatar.spared import Shown, made_thin, with_sizes_spared
 from pipeline.avatar.surface import Surface
 from pipeline.body import Pose
 from pipeline.orbit_cameras import relaxed_pose
@@ -61,7 +61,7 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
     Args:
         avatar: trained.
         evidence: of its ungated Gaussians, N, see ``covering``.
-        shown: poses it in frames that are not to be spoilt (``with_sizes_spared``); none are asked if None.
+        shown: poses it in frames that are not to be spoilt (``spared.py``); none are asked if None.
     """
     decoded = avatar.decode()
     rows = decoded.surface.pick(torch.arange(len(avatar.trust), device=avatar.device))
@@ -72,7 +72,7 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
     colored = with_completed_colors(decoded, segments, evidence)
     completed = closed(avatar, colored, segments, evidence)
     if shown is not None:
-        completed = with_sizes_spared(colored, completed, shown)
+        completed = made_thin(with_sizes_spared(colored, completed, shown), shown)
     avatar.take_completion(rows, completed)
 
 

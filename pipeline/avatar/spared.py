@@ -3,6 +3,9 @@
 Guessed Gaussians are made wide enough to cover. Just beyond a silhouette such a one stands out of it, in
 frames where training had made it vanish. So the frames are drawn with the trained sizes and with the
 completed ones, and each Gaussian is told by how much the pixels that it is in got worse.
+
+Thickness likewise: what frames saw squarely is as thick as it began, since they do not care, and from its
+side it stands out of the outline. So all are made thinner, but for those whose frames do care.
 """
 
 from __future__ import annotations
@@ -22,27 +25,45 @@ Shown = Callable[[Decoded], Iterable[tuple[Gaussians, View]]]
 """What was decoded -> for each of some frames the avatar in its pose, and the frame, on its device."""
 
 SPOILT = 0.003, 0.02  # mean error more, in [0, 1]: from none to all of the change of size is taken back
+HARDLY_SPOILT = 0.0002, 0.0015  # the same where all Gaussians change at once
+THIN = -0.6  # log scale along the normal
 ROUNDS = 2  # what is beside it is seen better when the first have gone
 LEAST_WEIGHT = 1e-3  # pixels, under which a Gaussian spoils nothing
 
 
 @torch.no_grad()
-def with_sizes_spared(trained: Decoded, completed: Decoded, shown: Shown) -> Decoded:
+def with_sizes_spared(
+    trained: Decoded,
+    completed: Decoded,
+    shown: Shown,
+    limits: tuple[float, float] = SPOILT,
+    rounds: int = ROUNDS,
+) -> Decoded:
     """What was completed, with log scales nearer to the trained ones where they spoil frames.
 
     Args:
         trained: with sizes as training left them, N Gaussians.
         completed: of the same surface.
         shown: poses either in the same frames, at least one.
+        limits: mean error more, in [0, 1], from which some, and all, of the change is taken back.
+        rounds: how often the frames are asked.
     """
     views, before = zip(*[(view, errors(one, view)) for one, view in shown(trained)], strict=True)
     share, spared = torch.ones_like(completed.log_scale[:, :1]), completed
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         after = (one for one, _ in shown(spared))
-        share = share * (1 - ramp(spoilt(before, after, views), *SPOILT)[:, None])
+        share = share * (1 - ramp(spoilt(before, after, views), *limits)[:, None])
         log_scale = torch.lerp(trained.log_scale, completed.log_scale, share)
         spared = dataclasses.replace(completed, log_scale=log_scale)
     return spared
+
+
+def made_thin(completed: Decoded, shown: Shown) -> Decoded:
+    """What was completed, no thicker along its normals than ``THIN`` where that hardly spoils frames."""
+    log_scale = completed.log_scale.clone()
+    log_scale[:, 2] = log_scale[:, 2].clamp_max(THIN)
+    thin = dataclasses.replace(completed, log_scale=log_scale)
+    return with_sizes_spared(completed, thin, shown, HARDLY_SPOILT, rounds=1)
 
 
 def errors(gaussians: Gaussians, view: View) -> Tensor:

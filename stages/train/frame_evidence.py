@@ -82,7 +82,7 @@ def settle_unseen(
     avatar.representation.forget_unseen(avatar.trust.amax(1) > 0)
     if settings.unseen in ("completed", "base"):
         complete_avatar(
-            avatar, evidence, lambda decoded: in_frames(avatar, decoded, poses, data, captured[::4])
+            avatar, evidence, lambda decoded: in_frames(avatar, decoded, poses, data, captured[::2])
         )
     if settings.unseen == "nothing":
         leave_seen(avatar)

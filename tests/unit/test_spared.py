@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pipeline.avatar.representation import Decoded
-from pipeline.avatar.spared import errors, spoilt, with_sizes_spared
+from pipeline.avatar.spared import THIN, errors, made_thin, spoilt, with_sizes_spared
 from pipeline.clip.camera import facing_camera
 from pipeline.clip.views import View
 from pipeline.splat import Gaussians, render
@@ -92,3 +92,23 @@ def test_what_is_in_no_picture_spoils_nothing(shown):
     away = dataclasses.replace(gaussians, means=gaussians.means + torch.tensor([0.0, 0, 5]))
     found = spoilt([torch.zeros(SIZE, SIZE)], [away], [view])
     assert torch.equal(found, torch.zeros(len(away)))
+
+
+def test_what_frames_saw_squarely_is_made_thin_and_a_rim_that_they_saw_is_not(shown):
+    """Two more Gaussians that frames see from their edge: thickness is what fills their pixels."""
+    whole = decoded(torch.zeros(2 * SIDE * SIDE, 3))
+    gaussians, view = shown(whole)[0]
+    turned = torch.tensor([0.5**0.5, 0, 0.5**0.5, 0])  # the normal along x, across the view
+    edge_on = torch.cat([gaussians.quaternions[:-2], turned.expand(2, 4)])
+    places = torch.cat([gaussians.means[:-2], torch.tensor([[-0.35, 0.0, -1], [0.35, 0.0, -1]])])
+    gaussians = dataclasses.replace(gaussians, quaternions=edge_on, means=places)
+
+    def posed(one: Decoded) -> list[tuple[Gaussians, View]]:
+        sized = dataclasses.replace(gaussians, scales=gaussians.scales * one.log_scale.exp())
+        seen = render(gaussians, CAMERA)
+        return [(sized, View(seen.color / seen.alpha.clamp_min(1e-6)[..., None], seen.alpha, view.camera))]
+
+    found = made_thin(whole, posed).log_scale
+    middle = ((LINE.abs() < 0.1)[:, None] & (LINE.abs() < 0.1)).flatten()
+    assert (found[: SIDE * SIDE, 2][middle] < THIN + 0.01).all() and (found[-2:, 2] > -0.05).all()
+    assert (found[:, :2] == 0).all()
