@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.avatar import Avatar
-from pipeline.avatar.canonical import dilate
 from pipeline.avatar.color_bounds import ANYWHERE, BRIGHTEST, DARKEST, ColorBounds
 from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.holes import around_holes
@@ -70,24 +69,26 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
         return
     segments = surface_segments(decoded.surface)
     colored = with_completed_colors(decoded, segments, evidence)
-    completed = closed(avatar, colored, segments, evidence)
-    if shown is not None:
+    covers = covering_log_scale(avatar.architecture.scale)
+    completed = with_completed_scales(colored, segments, evidence.shape_trust, covers)
+    if shown is None:
+        completed = closed(avatar, completed, covers)
+    else:
         completed = made_thin(with_sizes_spared(colored, completed, shown), shown)
+        completed = with_sizes_spared(completed, closed(avatar, completed, covers), shown)
     avatar.take_completion(rows, completed)
 
 
-def closed(avatar: Avatar, decoded: Decoded, segments: Segments, evidence: Evidence) -> Decoded:
-    """What was decoded with scales completed, and those about holes that are left no smaller than covers.
+def closed(avatar: Avatar, completed: Decoded, covers: float) -> Decoded:
+    """What was completed with the scales about holes no smaller than ``covers``, a log scale.
 
     Frames that show a surface from its edge alone let it become a sieve, which shows from its side.
     """
-    covers = covering_log_scale(avatar.architecture.scale)
-    completed = with_completed_scales(decoded, segments, evidence.shape_trust, covers)
-    mesh, still = decoded.surface.canonical, torch.zeros(3, device=avatar.device)
+    mesh, still = completed.surface.canonical, torch.zeros(3, device=avatar.device)
     expression = still.new_zeros(mesh.expression_directions.shape[-1])
     pose = Pose(relaxed_pose(ARMS).to(still), expression, still)
-    sieve = dilate(around_holes(avatar.pose(completed, pose).gaussians, mesh.faces), mesh.faces, rings=1)
-    larger = torch.maximum(completed.log_scale, torch.tensor([covers, covers, FLAT], device=avatar.device))
+    sieve = around_holes(avatar.pose(completed, pose).gaussians, mesh.faces)
+    larger = torch.maximum(completed.log_scale, still.new_tensor([covers, covers, FLAT]))
     log_scale = torch.where(sieve[:, None], larger, completed.log_scale)
     return dataclasses.replace(completed, log_scale=log_scale)
 

@@ -27,7 +27,6 @@ Shown = Callable[[Decoded], Iterable[tuple[Gaussians, View]]]
 SPOILT = 0.003, 0.02  # mean error more, in [0, 1]: from none to all of the change of size is taken back
 HARDLY_SPOILT = 0.0002, 0.0015  # the same where all Gaussians change at once
 THIN = -0.6  # log scale along the normal
-ROUNDS = 2  # what is beside it is seen better when the first have gone
 LEAST_WEIGHT = 1e-3  # pixels, under which a Gaussian spoils nothing
 
 
@@ -37,7 +36,6 @@ def with_sizes_spared(
     completed: Decoded,
     shown: Shown,
     limits: tuple[float, float] = SPOILT,
-    rounds: int = ROUNDS,
 ) -> Decoded:
     """What was completed, with log scales nearer to the trained ones where they spoil frames.
 
@@ -46,16 +44,11 @@ def with_sizes_spared(
         completed: of the same surface.
         shown: poses either in the same frames, at least one.
         limits: mean error more, in [0, 1], from which some, and all, of the change is taken back.
-        rounds: how often the frames are asked.
     """
     views, before = zip(*[(view, errors(one, view)) for one, view in shown(trained)], strict=True)
-    share, spared = torch.ones_like(completed.log_scale[:, :1]), completed
-    for _ in range(rounds):
-        after = (one for one, _ in shown(spared))
-        share = share * (1 - ramp(spoilt(before, after, views), *limits)[:, None])
-        log_scale = torch.lerp(trained.log_scale, completed.log_scale, share)
-        spared = dataclasses.replace(completed, log_scale=log_scale)
-    return spared
+    after = (one for one, _ in shown(completed))
+    share = 1 - ramp(spoilt(before, after, views), *limits)[:, None]
+    return dataclasses.replace(completed, log_scale=torch.lerp(trained.log_scale, completed.log_scale, share))
 
 
 def made_thin(completed: Decoded, shown: Shown) -> Decoded:
@@ -63,7 +56,7 @@ def made_thin(completed: Decoded, shown: Shown) -> Decoded:
     log_scale = completed.log_scale.clone()
     log_scale[:, 2] = log_scale[:, 2].clamp_max(THIN)
     thin = dataclasses.replace(completed, log_scale=log_scale)
-    return with_sizes_spared(completed, thin, shown, HARDLY_SPOILT, rounds=1)
+    return with_sizes_spared(completed, thin, shown, HARDLY_SPOILT)
 
 
 def errors(gaussians: Gaussians, view: View) -> Tensor:
