@@ -22,7 +22,7 @@ from pipeline.avatar.color_bounds import ANYWHERE, BRIGHTEST, DARKEST, ColorBoun
 from pipeline.avatar.evidence import Evidence, covering_log_scale
 from pipeline.avatar.holes import around_holes
 from pipeline.avatar.representation import Decoded
-from pipeline.avatar.spared import Shown, made_thin, with_sizes_spared
+from pipeline.avatar.spared import Shown, every_second, made_thin, with_sizes_spared
 from pipeline.avatar.surface import Surface
 from pipeline.body import Pose
 from pipeline.orbit_cameras import relaxed_pose
@@ -74,8 +74,9 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
     if shown is None:
         completed = closed(avatar, completed, covers)
     else:
-        completed = made_thin(with_sizes_spared(colored, completed, shown), shown)
-        completed = with_sizes_spared(completed, closed(avatar, completed, covers), shown)
+        some = every_second(shown)
+        completed = made_thin(with_sizes_spared(colored, completed, some), shown)
+        completed = with_sizes_spared(completed, closed(avatar, completed, covers), some)
     avatar.take_completion(rows, completed)
 
 

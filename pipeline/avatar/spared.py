@@ -11,6 +11,7 @@ side it stands out of the outline. So all are made thinner, but for those whose 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable
 
 import torch
@@ -24,6 +25,7 @@ from pipeline.splat import Gaussians, picture_sums, render
 Shown = Callable[[Decoded], Iterable[tuple[Gaussians, View]]]
 """What was decoded -> for each of some frames the avatar in its pose, and the frame, on its device."""
 
+EVERY = 2  # of the frames tells what a few large Gaussians spoil; all are asked where all change
 SPOILT = 0.003, 0.02  # mean error more, in [0, 1]: from none to all of the change of size is taken back
 HARDLY_SPOILT = 0.0002, 0.0015  # the same where all Gaussians change at once
 THIN = -0.6  # log scale along the normal
@@ -49,6 +51,11 @@ def with_sizes_spared(
     after = (one for one, _ in shown(completed))
     share = 1 - ramp(spoilt(before, after, views), *limits)[:, None]
     return dataclasses.replace(completed, log_scale=torch.lerp(trained.log_scale, completed.log_scale, share))
+
+
+def every_second(shown: Shown) -> Shown:
+    """The same of one in ``EVERY`` frames, the first among them."""
+    return lambda decoded: itertools.islice(shown(decoded), 0, None, EVERY)
 
 
 def made_thin(completed: Decoded, shown: Shown) -> Decoded:
