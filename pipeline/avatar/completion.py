@@ -77,6 +77,8 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
         some = every_second(shown)
         completed = made_thin(with_sizes_spared(colored, completed, some), shown)
         completed = with_sizes_spared(completed, closed(avatar, completed, covers), some)
+        # Where that leaves holes, as in a lap that a desk hides, frames are spoilt rather than a side.
+        completed = closed(avatar, completed, covers)
     avatar.take_completion(rows, completed)
 
 
