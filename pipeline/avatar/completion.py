@@ -2,8 +2,8 @@
 
 After training each Gaussian keeps what was learnt as far as evidence trusts it (``evidence.py``), and has for
 the rest colour and scale from its own segment of the body (``pipeline/texture/completion.py``); what
-follows the pose fades out likewise. Sizes change only as far as filmed pictures allow (``spared.py``). Seconds of work, no generator, and an avatar of which everything was
-seen stays as it was to the byte.
+follows the pose fades out likewise. Sizes change only as far as filmed pictures allow (``spared.py``).
+Seconds of work, no generator, and an avatar of which everything was seen stays as it was to the byte.
 
 The bases' representation takes the values as its own. The triplane cannot: its values are read from planes
 that other Gaussians read, too. So its avatar stores them beside the planes (``Avatar.completion``).
