@@ -30,7 +30,10 @@ class ColorBounds:
     hair: Tensor  # [N]
 
     def held(self, color: Tensor) -> Tensor:
-        """The nearest colours within the bounds, [N, 3]; those that are within stay to the bit.
+        """Colours brought within the bounds, [N, 3]; those that are within stay to the bit.
+
+        Every value that is changed lies within ``DARKEST`` and ``BRIGHTEST``, which may leave a very bright
+        or dark one of hair a little outside.
 
         Args:
             color: [N, 3], RGB in [0, 1].

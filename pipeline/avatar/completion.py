@@ -2,7 +2,8 @@
 
 After training each Gaussian keeps what was learnt as far as evidence trusts it (``evidence.py``), and has for
 the rest colour and scale from its own segment of the body (``pipeline/texture/completion.py``); what
-follows the pose fades out likewise. Sizes change only as far as filmed pictures allow (``spared.py``).
+follows the pose fades out likewise. Sizes change only as far as filmed pictures allow (``spared.py``), what
+was seen is made thin as far as they do, and holes that are left are closed in any case.
 Seconds of work, no generator, and an avatar of which everything was seen stays as it was to the byte.
 
 The bases' representation takes the values as its own. The triplane cannot: its values are read from planes
@@ -128,7 +129,7 @@ def calm_colors(decoded: Decoded, evidence: Evidence) -> ColorBounds:
     free = torch.full_like(evidence.square, ANYWHERE)
     color, telling, normals = _arrays(torch.sigmoid(decoded.color_logit), evidence.source, evidence.normals)
     if not (telling > 0).any():
-        return ColorBounds(torch.zeros_like(decoded.color_logit), free, torch.isnan(free))
+        return ColorBounds(torch.zeros_like(decoded.color_logit), free, free < 0)
     segments = surface_segments(decoded.surface)
     field, hair = (torch.from_numpy(one).to(free) for one in color_field(segments, color, telling, normals))
     apart = (torch.sigmoid(decoded.color_logit) - field).abs().amax(1)

@@ -21,7 +21,7 @@ from pipeline.finite import require_finite
 LEAST = 1e-3  # standard deviation of a direction that counts: a twentieth of a degree, or of an expression's
 SLACK = 0.1  # of the training frames' range, on either side of it
 BEND_AT = 0.7  # standard deviations from the mean at which a bend begins to act
-BEND_REACH = 0.3  # standard deviations beyond, that the clip has to reach
+BEND_REACH = 0.3  # standard deviations beyond, that the range of the clip with its slack has to reach
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 Guessed Gaussians are made wide enough to cover. Just beyond a silhouette such a one stands out of it, in
 frames where training had made it vanish. So the frames are drawn with the trained sizes and with the
-completed ones, and each Gaussian is told by how much the pixels that it is in got worse.
+completed ones, and each Gaussian is told by how much the pixels that it is in got worse. (Holes that this
+leaves are closed nonetheless, see ``completion.py``.)
 
 Thickness likewise: what frames saw squarely is as thick as it began, since they do not care, and from its
 side it stands out of the outline. So all are made thinner, but for those whose frames do care.

@@ -85,7 +85,7 @@ def _described(architecture: Architecture) -> dict:
             del sizes[name]
     del sizes["plane_deviation"]
     if architecture.representation == "triplane":
-        del sizes["representation"], sizes["bases"]
+        del sizes["representation"], sizes["bases"], sizes["bends"]
     return sizes
 
 

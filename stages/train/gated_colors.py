@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar import Avatar
-from pipeline.avatar.completion import BRIGHTEST, DARKEST
+from pipeline.avatar.color_bounds import BRIGHTEST, DARKEST
 from pipeline.avatar.sparse import SparsePair
 
 FILL_ROUNDS = 16  # rings over which gated vertices take their neighbours' colour

@@ -5,12 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from pipeline.avatar import load_avatar
+from pipeline.avatar import ClipConditions, load_avatar
 from pipeline.body import read_poses
 from pipeline.clip.records import Split, write_split
 from pipeline.finite import NotFiniteError
 from stages.train import run as stage
-from stages.train.settings import TrainSettings, apply_plan, settings_without_effect
+from stages.train.initial_avatar import architecture
+from stages.train.settings import TrainSettings, apply_plan, for_bases, settings_without_effect
 from tests.made.plans import plan_of
 from tests.made.portrait import context_for, data_for, trainer_for, with_footage, with_poses
 
@@ -23,6 +24,15 @@ def test_more_bases_than_frames_drive_are_as_many_as_they_drive(subject, tmp_pat
     assert 0 < trainer.avatar.architecture.bases <= 4  # five training frames less their mean
     assert trainer.level == len(trainer.avatar.surfaces) - 1  # the finest, from the first step
     trainer.step()
+
+
+@pytest.mark.parametrize(("frames", "asked", "bends"), [(99, 8, 0), (100, 8, 8), (100, 3, 3), (100, 0, 0)])
+def test_clips_of_a_hundred_frames_have_bends(frames, asked, bends):
+    generator = torch.Generator().manual_seed(2)
+    theta, expression = (torch.randn(frames, size, generator=generator) for size in (12, 4))
+    settings = for_bases(TrainSettings(bases=5, bends=asked))
+    found = architecture(settings, ClipConditions(theta, expression, ()), 4)
+    assert (found.bases, found.bends) == (5 + bends, bends)
 
 
 @pytest.mark.parametrize(("frames", "bases"), [((0,), 0), ((0, 4), 1)])

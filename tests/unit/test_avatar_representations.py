@@ -33,12 +33,12 @@ def conditions() -> ClipConditions:
 
 
 def an_avatar(body, kind: str, awake: bool = True, bases: int = K) -> Avatar:
-    """Half of the bases of "split bases" are bends."""
+    """All but one of the bases of "split bases" are bends, to either side."""
     split, kind = kind.startswith("split"), kind.removeprefix("split ")
     sizes = Architecture(
         plane_resolution=8, plane_channels=2, width=8, groups=2, residual_width=8, residual_parts=("face",),
         subdivisions=1, representation=kind, bases=bases if kind == "bases" else 0,
-        bends=bases // 2 if split else 0,
+        bends=bases - 1 if split else 0,
     )  # fmt: skip
     kept = torch.nonzero(body.v_template[:, 1] > 0.32)[:, 0]
     splits = some_splits(body, kept) if split else ()
