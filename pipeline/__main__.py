@@ -15,7 +15,7 @@ from pipeline.config.request import parse_request
 from pipeline.config.settings import help_lines, near
 from pipeline.errors import UserError, error_message
 from pipeline.run.job import open_job, run_stage
-from pipeline.run.process import end_process, leave_reason
+from pipeline.run.process import INTERRUPTED, end_process, leave_reason
 from pipeline.run.stage import load_stages
 
 
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(
             f"{options.stage}:{options.subject} stopped; the same command goes on from here", file=sys.stderr
         )
-        return 130
+        return INTERRUPTED
     except Exception as error:
         message = error_message(error, where)
         leave_reason(message or f"{type(error).__name__}: {error} (a defect; its traceback is above)")

@@ -24,6 +24,7 @@ from pipeline.store.artifact import Artifact
 REASON = "FLEXIAVATAR_REASON"
 """Environment variable: the file in which a failing stage leaves its reason for whoever started it."""
 
+INTERRUPTED = 130  # exit status of a stage that Ctrl-C stopped, as the shell's
 CROWDED = 1.5  # running processes a core
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG of prctl(2)
 
@@ -53,12 +54,17 @@ def run_stage_process(
         request: the command line's.
         log: a file that gets the stage's lines in place of this terminal.
         start: ``start_process`` if None.
+
+    Raises:
+        KeyboardInterrupt: the stage was stopped by Ctrl-C, whether or not this process heard it.
     """
     with tempfile.TemporaryDirectory(prefix="flexiavatar-") as folder:
         reason = Path(folder) / "reason"
         arguments = stage_arguments(stage, subject, request)
         status = (start or start_process)(arguments, {REASON: str(reason)}, log)
         said = reason.read_text(encoding="utf-8") if reason.is_file() else ""
+    if status in (INTERRUPTED, -signal.SIGINT):
+        raise KeyboardInterrupt
     if status < 0:
         return killed_by(-status)
     if status:

@@ -1,6 +1,7 @@
 """Stages whose code a loader has loaded: they run as any, and no process is left."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -8,7 +9,7 @@ import time
 import pytest
 
 from pipeline.config.request import parse_request
-from pipeline.run.process import run_stage_process
+from pipeline.run.process import INTERRUPTED, run_stage_process
 from pipeline.run.stage_loader import StageLoader, can_load_ahead
 from pipeline.run.stage_runner import StageRunner
 
@@ -78,3 +79,10 @@ def test_a_loader_that_the_system_killed_is_done_without(toy, monkeypatch):
         time.sleep(0.02)
     assert runner.run("bend", "ann", TOYS[1:]) is None and toy.ran() == ["gather:ann", "bend:ann"]
     runner.close()
+
+
+@pytest.mark.parametrize("status", [INTERRUPTED, -signal.SIGINT])
+def test_a_stage_that_ctrl_c_stopped_stops_whoever_started_it(toy, status):
+    """Also where the starter did not hear it itself: a run must not go on, nor call it a failure."""
+    with pytest.raises(KeyboardInterrupt):
+        run_stage_process("bend", "ann", request_of(toy), start=lambda *_: status)
