@@ -92,7 +92,7 @@ def closed(avatar: Avatar, completed: Decoded, covers: float) -> Decoded:
     expression = still.new_zeros(mesh.expression_directions.shape[-1])
     pose = Pose(relaxed_pose(ARMS).to(still), expression, still)
     sieve = around_holes(avatar.pose(completed, pose).gaussians, mesh.faces)
-    larger = torch.maximum(completed.log_scale, still.new_tensor([covers, covers, FLAT]))
+    larger = torch.maximum(completed.log_scale, torch.tensor([covers, covers, FLAT], device=avatar.device))
     log_scale = torch.where(sieve[:, None], larger, completed.log_scale)
     return dataclasses.replace(completed, log_scale=log_scale)
 

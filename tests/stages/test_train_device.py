@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pipeline.avatar import head as heads
-from pipeline.avatar import holes, load_avatar
+from pipeline.avatar import holes, load_avatar, spared
 from pipeline.avatar import skinning_tables as posing
 from pipeline.body import Pose
 from pipeline.clip import curves
@@ -26,7 +26,7 @@ ALL_ON = {
     "scale_size": 0.1, "pose_change": 0.1, "time_dropout": 0.5,
     "iterations": 6, "held_out_every": 3, "checkpoint_every": 2, "gate_threshold": 0.2, "gate_from": 0.3,
 }  # fmt: skip
-RENDERERS = (objective, held_out, holes, importlib.import_module("pipeline.splat.render"))
+RENDERERS = (objective, held_out, holes, spared, importlib.import_module("pipeline.splat.render"))
 
 
 def without_kernels(monkeypatch):
