@@ -72,15 +72,12 @@ def complete_avatar(avatar: Avatar, evidence: Evidence, shown: Shown | None = No
     colored = with_completed_colors(decoded, segments, evidence)
     covers = covering_log_scale(avatar.architecture.scale)
     completed = with_completed_scales(colored, segments, evidence.shape_trust, covers)
-    if shown is None:
-        completed = closed(avatar, completed, covers)
-    else:
+    if shown is not None:
         some = every_second(shown)
         completed = made_thin(with_sizes_spared(colored, completed, some), shown)
         completed = with_sizes_spared(completed, closed(avatar, completed, covers), some)
-        # Where that leaves holes, as in a lap that a desk hides, frames are spoilt rather than a side.
-        completed = closed(avatar, completed, covers)
-    avatar.take_completion(rows, completed)
+    # Where sparing left holes, as in a lap that a desk hides, frames are spoilt rather than a side.
+    avatar.take_completion(rows, closed(avatar, completed, covers))
 
 
 def closed(avatar: Avatar, completed: Decoded, covers: float) -> Decoded:
